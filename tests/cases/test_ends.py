@@ -107,6 +107,7 @@ def made(executor: Executor, jobs: Sequence[Job], out: Path) -> Iterator[tuple[J
             yield job, str(problem)
 
 
+@pytest.mark.slow
 def test_a_batch_counts_a_lost_run_as_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
