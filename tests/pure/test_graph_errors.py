@@ -16,6 +16,7 @@ from sigmasplat.data.atlas import Atlas
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.relative_pose import Edges, Kind, RelativePose, SolvedGraph
 from sigmasplat.final.stores import KeyframeNodes
+from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph import graph_errors
 from sigmasplat.graph.graph_errors import (
     CALIBRATION,
@@ -210,3 +211,12 @@ def test_errors_of_calibration_are_those_of_points_that_a_wrong_camera_sees(moti
         assert np.allclose(found[:, parameter], true, atol=0.01 * np.abs(true).max() + 1e-5)
     if not any(motion[3:]):
         assert np.allclose(found[:, 0], motion, atol=1e-9), "a longer metre: a longer way"
+
+
+@pytest.mark.parametrize("width", [32, 64, 320])
+def test_an_image_shows_points_at_every_size_and_only_a_few(width: int) -> None:
+    height = width * 3 // 4
+    gray, depth_m = np.full((height, width), 0.5, np.float32), np.full((height, width), 2.0, np.float32)
+    whole = Pyramid.of(gray, depth_m, Camera(width, height, width, width, width / 2, height / 2))
+    for image in (whole, whole.finest()):
+        assert 4 <= len(image.points) < 80 * 80 and np.allclose(image.points[:, 2], 2.0)

@@ -58,9 +58,9 @@ class Pyramid:
 
     @property
     def points(self) -> Matrix:
-        """Return the points [P, 3] that the coarsest size shows, m, in the axes of the camera; as many fewer as coarser
-        sizes are left out here."""
-        step = 2 ** (LEVELS - len(self.cameras))
+        """Return the points [P, 3] that the coarsest size shows, m, in the axes of the camera: of 40 to 79 columns, if
+        it has so many."""
+        step = max(1, self.cameras[-1].width // 40)
         depth_m: Matrix = np.asarray(self.kernels.to_host(self.depth[-1])[::step, ::step], np.float64)[..., None]
         return np.asarray((self.cameras[-1].rays()[::step, ::step] * depth_m)[depth_m[..., 0] > 0])
 
