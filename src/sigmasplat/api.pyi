@@ -215,6 +215,7 @@ from sigmasplat.input.opening import (
     without_depth as without_depth,
 )
 from sigmasplat.input.recorded import (
+    KNOWN_UNITS_PER_METRE as KNOWN_UNITS_PER_METRE,
     PLAUSIBLE_MEDIAN_M as PLAUSIBLE_MEDIAN_M,
     ImagePair as ImagePair,
     RecordedSource as RecordedSource,

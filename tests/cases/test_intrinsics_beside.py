@@ -141,6 +141,16 @@ def test_a_given_focal_length_and_a_calibration_json_come_first(tmp_path: Path) 
     assert open_source(folder).camera.fx == 50.0
 
 
+def test_the_lens_of_another_file_does_not_join_the_camera_of_a_calibration_json(tmp_path: Path) -> None:
+    folder = written(tmp_path / "a", "camera_info.yaml", ROS)
+    camera = '{"fx": 50, "fy": 50, "cx": 15, "cy": 12}'
+    (tmp_path / "own.json").write_text(camera)
+    given = open_source(folder, calibration=str(tmp_path / "own.json"))
+    (folder / "calibration.json").write_text(camera)
+    for source in (given, open_source(folder)):
+        assert any(line.startswith("lens: no distortion") for line in source.assumptions)
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [

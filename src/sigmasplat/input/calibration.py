@@ -22,7 +22,7 @@ Distortion = tuple[float, ...]
 
 GIVEN, MEASURED, ASSUMED = "given", "measured", "assumed"
 ALONG_RAY = "along the ray, converted to z"
-"""What depth values are that are converted."""
+"""Words for depth that is converted when it is read."""
 
 
 class Origin(NamedTuple):

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.files.reading import read_text
+from sigmasplat.config import InputConfig
+from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import Calibration, Origin, build_camera
 
 NAMES = re.compile(
@@ -22,12 +23,15 @@ SIZED = r"[\"']?(?:rows|cols|dt)[\"']?\s*:\s*\w+[,\s]*"
 OPENED = rf"[\"']?\s*[:=]\s*(?:!!opencv-matrix\s*)?\{{?\s*(?:{SIZED})*(?:[\"']?data[\"']?\s*:\s*)?"
 """What is between a key and its numbers in YAML and JSON: nothing more than a colon, or the head of a matrix."""
 MOST_BYTES = 1 << 16
+Size = tuple[int, int]
 
 
-def intrinsics_beside(folder: Path, size: tuple[int, int], units: float) -> Calibration | None:
+def intrinsics_beside(folder: Path, settings: InputConfig, size: Size, units: float) -> Calibration | None:
     """Return the calibration in the first such file of a folder that holds a camera for images of (width, height);
-    None without one. units: of depth, if the file has none."""
-    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    None without one, and if there is a calibration.json: the lens of one file must not join the camera of another.
+    units: of depth, if the file has none."""
+    stated = settings.calibration or exists(folder / "calibration.json")
+    files = sorted(folder.iterdir()) if folder.is_dir() and not stated else []
     for path in files:
         if path.suffix.lower() in ENDINGS and NAMES.fullmatch(path.stem.lower()) and path.is_file():
             text = re.sub(r"(?m)#.*$", "", read_text(path, most=MOST_BYTES)).lower()
@@ -36,7 +40,7 @@ def intrinsics_beside(folder: Path, size: tuple[int, int], units: float) -> Cali
     return None
 
 
-def _calibration(path: Path, text: str, size: tuple[int, int], units: float) -> Calibration | None:
+def _calibration(path: Path, text: str, size: Size, units: float) -> Calibration | None:
     named = [_numbers(text, rf"(?:\w*[._])?{key}")[:1] for key in ("fx", "fy", "cx", "cy")]
     focal, lens = [number for found in named for number in found], _numbers(text, LENSES)[:5]
     lens = lens or [n for key in ("k1", "k2", "p1", "p2", "k3") for n in _numbers(text, rf"(?:\w*[._])?{key}")[:1]]

@@ -176,8 +176,8 @@ class RecordedSource(Source):
     def frame(self, i: int) -> Frame:
         """Read frame i: colour and depth of one camera, lens distortion removed."""
         files = self._images[self._checked_index(i)]
-        recorded, depth_m = files.read(self._units)
-        depth_m, color = depth_m / self._float_units, color_from_bytes(self._rgb(files.color, recorded))
+        recorded, stored_m = files.read(self._units)
+        depth_m, color = self._in_metres(stored_m), color_from_bytes(self._rgb(files.color, recorded))
         check_image_sizes(self._rectified, files.color, color.shape[1::-1], files.depth, depth_m.shape[::-1])
         color, depth_m = self._rectified(self._of_one_camera(i, color), self._of_one_camera(i, depth_m))
         color = resized_color(color, self.camera.width, self.camera.height)
@@ -190,9 +190,13 @@ class RecordedSource(Source):
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         files = self._images[self._checked_index(i)]
-        depth_m, camera = files.read_depth(self._units) / self._float_units, self._rectified.calibration.camera
+        depth_m, camera = self._in_metres(files.read_depth(self._units)), self._rectified.calibration.camera
         check_image_sizes(self._rectified, files.color, (camera.width, camera.height), files.depth, depth_m.shape[::-1])
         return self._rectified.depth(self._of_one_camera(i, depth_m))
+
+    def _in_metres(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return depth as it was read, divided by the given units if it is stored as floats."""
+        return depth_m if self._float_units == 1.0 else depth_m / self._float_units
 
     def _of_one_camera(self, i: int, image: NDArray[np.float32]) -> NDArray[np.float32]:
         known = self._rectified.calibration
@@ -249,7 +253,7 @@ class RecordedSource(Source):
         count = min(SAMPLES, max(3, MOST_PIXELS // int(np.prod(found.depth_size))))
         for i in evenly_spaced(len(self), count if along != "z" else 0):
             with suppress(SourceError):  # reported when the source is iterated
-                depth_m = self._images[i].read_depth(self._units) / self._float_units
+                depth_m = self._in_metres(self._images[i].read_depth(self._units))
                 if depth_m.shape[::-1] == found.depth_size:
                     images.append(thinned(found.without_lens(depth_m)))
         meaning = meaning_of(images, found.depth_camera, self._units, along)
@@ -279,7 +283,7 @@ def folder_source(
     pixels than colour has the same camera, as on phones; more: as for RecordedSource. Raises SourceError as it does.
     """
     size, depth_size = first_readable(images, lambda pair: pair.sizes())
-    known = known or intrinsics_beside(folder, size, units_per_metre)
+    known = known or intrinsics_beside(folder, settings, size, units_per_metre)
     calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
     camera, lens = calibration.camera, calibration.distortion
     if known and known.own and camera != known.camera:

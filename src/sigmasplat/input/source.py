@@ -104,11 +104,9 @@ class Source(ABC):
     @property
     def corrections(self) -> list[str]:
         """Return how images are read in another way than they are stored, because of what they show or say."""
-        changed = {name: o for name, o in self.origins.items() if name in CORRECTED and o.origin != ASSUMED}
-        changed |= {name: o for name, o in self.origins.items() if o.value == ALONG_RAY}
-        said = {name: f"{name}: {o.value}" + f" ({o.option})" * bool(o.option) for name, o in changed.items()}
-        camera = self.origins.get("camera", Origin("", "")).origin
-        return [*said.values()] + [f"camera: {camera}"] * camera.startswith(MEASURED)
+        changed = [(n, o.value) for n, o in self.origins.items() if n in CORRECTED or o.value == ALONG_RAY]
+        measured = [(n, o.origin) for n, o in self.origins.items() if n == "camera" and o.origin.startswith(MEASURED)]
+        return [f"{name}: {words}" for name, words in changed + measured]
 
     @abstractmethod
     def __len__(self) -> int:

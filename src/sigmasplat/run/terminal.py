@@ -50,9 +50,9 @@ class Screen:
 
     def assumptions(self, assumed: Sequence[str], corrections: Sequence[str]) -> None:
         """Print what is assumed because a recording does not say it, and how its images are corrected, in one block."""
-        for title, lines in {ASSUMED: assumed, CORRECTED: corrections}.items():
-            for line in [title, *(f"  {line}" for line in lines)] if lines else ():
-                self.say(line)
+        for title, lines in ((ASSUMED, assumed), (CORRECTED, corrections)):
+            if lines:
+                self.say("\n  ".join([title, *lines]))
 
     @contextmanager
     def steps(self, total: int | None, done: int = 0) -> Iterator["_StepShow"]:

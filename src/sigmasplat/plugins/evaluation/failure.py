@@ -4,7 +4,16 @@ from collections import Counter
 
 import numpy as np
 
-from sigmasplat.api import APART, LOST, RunFolder, Source, Trajectory, depth_warning, format_ranges
+from sigmasplat.api import (
+    APART,
+    KNOWN_UNITS_PER_METRE,
+    LOST,
+    RunFolder,
+    Source,
+    Trajectory,
+    depth_warning,
+    format_ranges,
+)
 from sigmasplat.plugins.evaluation.metrics.trajectory import absolute_error, align_similarity, pair_poses
 from sigmasplat.plugins.evaluation.report.page import rerun_command
 
@@ -20,11 +29,10 @@ CAUSES = {
 """What the judge of poses says of a lost frame (`pose_validation.diagnosis`), by a part of its words."""
 WRONG_SCALE, FITTED, FEWEST = 0.05, 0.1, 10
 """A scale is wrong if it differs more from 1; errors then left, by the extent of the path; poses that determine it."""
-USUAL_UNITS = (1000.0, 5000.0, 6553.5, 10000.0, 1.0)
 
 
 def failure(run: RunFolder, source: Source) -> dict[str, list[str]]:
-    """Return why a run failed, and commands to try; nothing if two thirds of its frames have a pose in one map."""
+    """Return why a run failed, and commands to try; nothing if two thirds of its frames have a pose, none apart."""
     frames, config, facts = run.read_frames(), run.config(), run.facts()
     without = sorted([*frames.indices(LOST), *(apart := frames.indices(APART))])
     if not apart and len(without) <= MOST_LOST * len(frames):
@@ -58,8 +66,9 @@ def wrong_scale(run: RunFolder, source: Source, scale: float | None) -> dict[str
     said = f"WRONG SCALE: the path is {times:.{1 + (times < 1.5)}f} times too {'small' if scale > 1.0 else 'large'}"
     if not units or config.input.poses:
         return {said: []}
-    true = next((u for u in USUAL_UNITS if abs(u * scale / units - 1.0) < WRONG_SCALE), float(f"{units / scale:.2g}"))
-    what, remedy = "the depth unit" if true in USUAL_UNITS else "depth or the focal length", f"--depth-scale {true:g}"
+    usual = next((u for u in KNOWN_UNITS_PER_METRE if abs(u * scale / units - 1.0) < WRONG_SCALE), None)
+    what = "the depth unit" if usual else "depth or the focal length"
+    remedy = f"--depth-scale {usual or float(f'{units / scale:.2g}'):g}"
     origin = source.origins.get("depth unit")
     said += f": {what} is probably wrong ({origin.origin if origin else 'now'} {units:g} per metre; {remedy})"
     return {said: [f"{rerun_command(config, run.facts())} {remedy}"]}

@@ -64,7 +64,7 @@ def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]
     up = up_of(path.T_world_camera, reader.run.facts(), edge)
     samples = list(sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend)))
     try:
-        R, share = floor_frame(samples, up)[:3, :3], 0.0
+        R = floor_frame(samples, up)[:3, :3]
         share = level_share(samples, R[2])
     except SigmaSplatError:
         R, share = level_cameras(path, up), 0.0
@@ -76,6 +76,6 @@ def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]
 def level_cameras(path: Trajectory, up: Up | None = None) -> Matrix:
     """Return R_floor_world [3, 3] without a map: z is up, by default as the cameras are held; y is level and ahead."""
     poses = path.T_world_camera
-    about = (up or up_of(poses)).about
-    ahead = horizontal(poses[0], about)
-    return np.stack([np.cross(ahead, about), ahead, about])
+    z = (up or up_of(poses)).up
+    ahead = horizontal(poses[0], z)
+    return np.stack([np.cross(ahead, z), ahead, z])

@@ -117,9 +117,10 @@ def _pairs(folder: Path, colors: list[Path], depths: list[Path], settings: Input
 
 
 def _timed_pairs(
-    folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig, *times_s: NDArray[np.float64]
-) -> Found:
-    color_s, depth_s = times_s[0], times_s[1] - settings.depth_delay_s
+    folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig,
+    color_s: NDArray[np.float64], depth_s: NDArray[np.float64],
+) -> Found:  # fmt: skip
+    depth_s = depth_s - settings.depth_delay_s
     pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s}, settings)
     late_s = {(i, j): float(depth_s[j] - color_s[i]) for i, j in pairs}
     images = [ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=s) for (i, j), s in late_s.items()]
@@ -155,7 +156,7 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
         times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else ASSUMED_TIMES
         images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", NAMED)}
     size = first_size([image.color for image in images])
-    beside = None if "intrinsic_matrix" in fields else intrinsics_beside(folder, size, MM_PER_METRE)
+    beside = None if "intrinsic_matrix" in fields else intrinsics_beside(folder, settings, size, MM_PER_METRE)
     known = beside or (_recorded(file, fields) if file else PRIMESENSE)
     truth = _truth(folder, images)
     return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins)

@@ -127,7 +127,7 @@ MAX_POINTS = 16_000
 class Up(NamedTuple):
     """About where up is: a unit vector [3] of the world, and the cosine of the largest angle to it; how it is known."""
 
-    about: Matrix
+    up: Matrix
     within_cos: float
     how: str
 
@@ -151,20 +151,17 @@ def level_share(samples: Sequence[SurfaceSample], up: Matrix) -> float:
     return float(area[np.abs(normals @ up) > PARALLEL_COS].sum() / area.sum())
 
 
-def floor_frame(samples: Sequence[SurfaceSample], up: Up | None = None) -> Matrix:
+def floor_frame(samples: Sequence[SurfaceSample], about: Up | None = None) -> Matrix:
     """Return T_floor_world: z up, floor at z = 0, origin below the first camera, x and y along the walls.
 
-    up: about where it is; None: as the cameras of the samples are held. The floor and the walls make it exact. y is the
+    about: where up is; None: as the cameras of the samples are held. The floor and the walls make it exact. y is the
     direction along the walls that is nearest to the viewing direction of the first camera. Raises SigmaSplatError if no
     surface is visible.
     """
     points, normals, area = _subsampled(samples)
     poses = np.stack([sample.T_world_camera for sample in samples])
-    about, within_cos, _ = up or up_of(poses)
-    return _floor_frame(points, normals, area, poses, up_direction(normals, area, about, within_cos))
-
-
-def _floor_frame(points: Matrix, normals: Matrix, area: Matrix, poses: Matrix, up: Matrix) -> Matrix:
+    about = about or up_of(poses)
+    up = up_direction(normals, area, about.up, about.within_cos)
     height_m = floor_height(points @ up, normals @ up, area, float((poses[:, :3, 3] @ up).min()))
     ahead = horizontal(poses[0], up)
     ahead = along_walls(normals, area, up, ahead)
