@@ -75,6 +75,28 @@ def test_black_frames_and_jumps_are_found() -> None:
     assert "jumps 1 times (first: before frame 32)" in watch.warnings()[0]
 
 
+@pytest.mark.parametrize("what", ["depth late", "no depth", "nothing"])
+def test_what_drifts_during_a_run_is_said_once_and_at_once(shaken: Motion, what: str) -> None:
+    """Depth falls behind colour, or is lost, after a third of a recording; a steady one is quiet."""
+    depth_m, gray = np.concatenate([shaken.depth_m] * 3), np.concatenate([shaken.gray] * 3)
+    if what == "depth late":
+        depth_m[FRAMES:] = np.roll(depth_m[FRAMES:], 4, axis=0)
+    if what == "no depth":
+        depth_m[FRAMES:, :, 20:] = 0.0
+    said = list[tuple[int, str]]()
+    watch = MotionWatch(lambda line: said.append((i, line)))
+    for i, (image, depth) in enumerate(zip(gray, depth_m, strict=True)):
+        color = np.repeat(image[..., None], 3, axis=2)
+        watch(Frame(i, i / 30.0, color, depth, Camera(80, 60, 60.0, 60.0, 39.5, 29.5)))
+    assert not [line for line in watch.warnings() if "depth" in line]
+    if what == "nothing":
+        assert not said
+        return
+    ((frame, line),) = said
+    assert FRAMES <= frame < 3 * FRAMES - 1 and line.startswith(f"about frame {frame}: ")
+    assert ("depth is 0.1" in line and "behind colour" in line) if what == "depth late" else "0% at first" in line
+
+
 def test_times_are_checked_for_unit_order_and_gaps() -> None:
     assert time_warnings(TIMES) == [] and time_warnings(TIMES[:1]) == []
     assert f"{rate(TIMES * 1e3)} frames per second" in time_warnings(TIMES * 1e3)[0]

@@ -224,7 +224,7 @@ def _run_and_score(
     if system:
         state.run_save = system.save
         folder.note(realtime=True)
-    motion = MotionWatch()
+    motion = MotionWatch(screen.warn)
     with (
         bag_options.robot_output(screen, start.slam, folder, robot_options) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,

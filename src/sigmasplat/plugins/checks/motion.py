@@ -6,7 +6,8 @@ of colour and of depth. Both follow the motion of the camera, so that their best
 them.
 """
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -68,6 +69,8 @@ def time_warnings(times_s: NDArray[np.float64]) -> list[str]:
 
 
 Numbers = NDArray[np.float64]
+Reduced = tuple[float, NDArray[np.float32], NDArray[np.float32]]
+"""Time in seconds, small gray image [h, w], small depth image [h, w] in metres."""
 
 WIDTH, REACH, FEWEST = 80, 8, 40
 """Image width, pixels, at which frames are compared; largest delay that is searched, frames; a delay is estimated from
@@ -78,6 +81,10 @@ without a delay by this, and if it has at least so many frames."""
 JUMP, JUMP_LEAST, BLACK = 2.8, 0.08, 0.02
 """A view jumps if the image changes by more than this multiple of the median change around it, and by at least this on
 average; a frame is black if 99 % of its pixels are below this; colours 0 to 1."""
+MANY_HOLES = 0.45
+"""If more than this share of the pixels has no depth, warn."""
+RECENT, EVERY_S = 80, 1.0
+"""While a run goes on, so many recent frames are compared with the first ones, once in so many seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +98,12 @@ class Motion:
     @staticmethod
     def of(frames: Iterable[Frame]) -> "Motion":
         """Reduce the frames."""
-        times, grays, depths = [], [], []
-        for frame in frames:
-            step = max(1, frame.camera.width // WIDTH)
-            height, width = (size // step * step for size in frame.depth_m.shape)
-            grays.append(reduced(frame.color))
-            depths.append(frame.depth_m[step // 2 : height : step, step // 2 : width : step])
-            times.append(frame.timestamp_s)
+        return Motion.joined([(frame.timestamp_s, reduced(frame.color), thinned(frame.depth_m)) for frame in frames])
+
+    @staticmethod
+    def joined(frames: Iterable["Reduced"]) -> "Motion":
+        """Join reduced frames."""
+        times, grays, depths = zip(*frames, strict=True) if frames else ((), (), ())
         return Motion(np.array(times), np.array(grays, np.float32), np.array(depths, np.float32))
 
     def changes(self) -> Numbers:
@@ -129,16 +135,46 @@ class Motion:
 
 @dataclass(eq=False)
 class MotionWatch:
-    """Looks for black and jumping frames. It keeps two numbers per frame, and one image."""
+    """Looks for black and jumping frames, and every second for what drifts: the share of pixels without depth, compared
+    with the start, and the delay between colour and depth. It keeps two numbers per frame, and `RECENT` small images.
 
+    warn: gets what has changed at once, in one line, each kind once.
+    """
+
+    warn: Callable[[str], None] = lambda line: None
     numbers: list[int] = field(default_factory=list)
     black: list[int] = field(default_factory=list)
     changes: list[float] = field(default_factory=list)
     last: NDArray[np.float32] | None = None
+    recent: deque[Reduced] = field(default_factory=lambda: deque(maxlen=RECENT))
+    holes_at_first: float | None = None
+    told: set[str] = field(default_factory=set)
+    looked_s: float = -np.inf
 
     def __call__(self, frame: Frame) -> None:
         """Take the next frame into account."""
-        self.add(frame.index, reduced(frame.color))
+        gray = reduced(frame.color)
+        self.add(frame.index, gray)
+        self.recent.append((frame.timestamp_s, gray, thinned(frame.depth_m)))
+        if frame.timestamp_s - self.looked_s >= EVERY_S:
+            self.look(frame.index)
+            self.looked_s = frame.timestamp_s
+
+    def look(self, number: int) -> None:
+        """Compare the recent frames with the first ones, and warn of what has changed."""
+        motion = Motion.joined(self.recent)
+        holes, late = float((motion.depth_m == 0).mean()), late_warning(motion)
+        if self.holes_at_first is None:
+            self.holes_at_first = holes
+        found = {"late": f"about frame {number}: {late}"} if late else {}
+        if holes > MANY_HOLES and holes > 2.0 * self.holes_at_first:
+            found["holes"] = (
+                f"about frame {number}: {holes:.0%} of the pixels have no depth, {self.holes_at_first:.0%} at first; "
+                "go nearer, or away from sunlight, glass and black surfaces"
+            )
+        for kind in found.keys() - self.told:
+            self.warn(found[kind])
+        self.told |= found.keys()
 
     def add(self, number: int, gray: NDArray[np.float32]) -> None:
         """Take the next frame into account, as a gray image."""
@@ -151,7 +187,9 @@ class MotionWatch:
         self.last = gray
 
     def warnings(self) -> list[str]:
-        """Return warnings about the frames so far."""
+        """Return warnings about the frames so far, without those that were told."""
+        if self.recent:
+            self.look(self.numbers[-1])
         change, warnings = np.array(self.changes), list[str]()
         usual = ndimage.median_filter(change, size=min(21, len(change)), mode="nearest") if len(change) else change
         jumps = np.array(self.numbers)[1:][(change > JUMP * usual) & (change > JUMP_LEAST)].tolist()
@@ -172,6 +210,13 @@ def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
     height, width = (size // step * step for size in color.shape[:2])
     rows = color[:height, :width].reshape(height // step, step, width // step, step * 3)
     return np.asarray(rows.mean((1, 3)), np.float32)
+
+
+def thinned(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return every k-th reading of a depth image [H, W], about `WIDTH` pixels wide."""
+    step = max(1, depth_m.shape[1] // WIDTH)
+    height, width = (size // step * step for size in depth_m.shape)
+    return depth_m[step // 2 : height : step, step // 2 : width : step]
 
 
 def _varying(energy: Numbers) -> Numbers:

@@ -26,7 +26,7 @@ from sigmasplat.api import (
     unlikely_camera,
 )
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
-from sigmasplat.plugins.checks.motion import Motion, late_warning, motion_warnings, rate, time_warnings, times_of
+from sigmasplat.plugins.checks.motion import MANY_HOLES, Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.sources import open_source
 
 SAMPLES, SMALL_PX = 16, 640
@@ -37,14 +37,12 @@ USUAL_FOCAL = 0.9
 """Typical focal length of depth cameras, in image widths: a field of view of 58°. Enough to inspect, not to map."""
 CONSECUTIVE = 300
 """Number of consecutive frames, in the middle of the recording, whose motion is checked."""
-MANY_UNUSED, MANY_HOLES = 0.05, 0.45
-"""If more than these shares of the images are not used, or of the pixels have no depth, warn."""
+MANY_UNUSED = 0.05
+"""If more than this share of the images is not used, warn."""
 MAX_BRIGHTNESS_STEP = 0.2
 """If the median change of brightness between sampled frames is larger than this share, suggest `tracking.exposure`."""
 FIRST, LOOKED_AT, ENOUGH_S = 150, 4, 0.5
 """Before a run, so many of the first frames are looked at, fewer if they are not read in this time."""
-QUICK_PX, QUICK = 320 * 240, 80
-"""If images have so few pixels, the motion in so many of the first frames is checked too."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +115,6 @@ def first_look(source: Source) -> tuple[str, list[str]]:
         *filter(None, [unlikely_camera(source.camera), depth_warning(source, read=frames)]), *source.depth_doubts,
         *_registration_warnings(source, agreement),
     ]  # fmt: skip
-    if source.camera.width * source.camera.height <= QUICK_PX and source.depth_units_per_metre:
-        delay = late_warning(Motion.of(_readable(source, (), range(min(QUICK, len(source))), [], [])))
-        warnings += [delay] if delay else []
     unit, readings = "" if source.predicted_depth else " m", _readings(frames)
     low, middle, high = np.percentile(readings, (1, 50, 99)) if len(readings) else (0.0, 0.0, 0.0)
     depth = f"depth {low:.2f} to {high:.2f}{unit}, median {middle:.2f}{unit}, {_holes(frames):.0%} without"
