@@ -2,8 +2,9 @@
 
 Each run is `sigmasplat run` in its own process: of this checkout, and of another one if --before gives its command.
 A run folder that is complete is read, not repeated, unless --fresh. PSNR is the mean of the views. A pixel is wrong if
-its error (root mean square of the channels) is above 0.1. V declares it if 2·√V is above 0.1. A spike is a splat with
-an axis ratio above 20 and a footprint (three standard deviations on both sides) longer than 20 px.
+its error (root mean square of the channels) is above 0.1. V declares it if 2·√V is above 0.1. A pixel was seen if an
+image of the recording shows its surface, by the exact depth of both; no map knows the colour of the others. A spike is
+a splat with an axis ratio above 20 and a footprint (three standard deviations on both sides) longer than 20 px.
 Writes benchmarks/results/<name>-<machine>.json and prints a table.
 
 example: python benchmarks/away_from_path.py --before ../before/.venv/bin/sigmasplat --seeds 0
@@ -13,6 +14,7 @@ import json
 import shlex
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +25,7 @@ import record
 import torch
 import tyro
 from finished_run import aligned_poses
+from numpy.typing import NDArray
 from tables import Section
 
 from sigmasplat.commands.options import Settings
@@ -45,9 +48,13 @@ ROOM = "synthetic:frames=200,noise=1,exposure_change=0,seed={seed}"
 AWAY_M, AWAY_RAD = np.array([0.6, 0.5, 0.6]), np.deg2rad([10.0, 27.0, 8.0])
 """At most 0.98 m and 29.9° off the path."""
 WRONG, AXIS_RATIO, FOOTPRINT_PX = 0.1, 20.0, 20.0
+SEEN_STRIDE, SAME_SURFACE = 4, 0.03
+"""Every fourth image of the recording decides what was seen; depths of one surface differ by less, a share of depth."""
 COLUMNS = (
     ("PSNR, dB", "psnr_db", 2, 1.0),
     ("wrong pixels, %", "wrong", 1, 100.0),
+    ("never seen, %", "unseen", 1, 100.0),
+    ("seen and wrong, %", "seen_wrong", 2, 100.0),
     ("of these declared, %", "declared", 1, 100.0),
     ("right pixels declared, %", "false", 1, 100.0),
     ("spikes per view", "spikes", 1, 1.0),
@@ -109,21 +116,44 @@ def scores(run: RunFolder, options: Options, seed: int) -> dict[str, float]:
     T_estimate_truth = aligned_poses(truth.T_world_camera[true_rows], path.T_world_camera[matched])
     poses = away.truth()
     assert poses is not None
-    rows = [
-        view_scores(field, working_frame(away, settings, i), se3.inverse(T_estimate_truth @ T), near_m)
-        for i, T in enumerate(poses.T_world_camera)
+    recorded_views = [
+        (working_frame(room, settings, i), truth.T_world_camera[i]) for i in range(0, len(room), SEEN_STRIDE)
     ]
+    rows = []
+    for i, T in enumerate(poses.T_world_camera):
+        frame = working_frame(away, settings, i)
+        wrong, row = view_scores(field, frame, se3.inverse(T_estimate_truth @ T), near_m)
+        known = seen(frame, T, recorded_views)
+        rows.append(row | {"unseen": float((~known).mean()), "seen_wrong": float((wrong & known).mean())})
     means = {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
     return means | {"splats": len(field)}
 
 
-def view_scores(field: GaussianField, frame: Frame, T_camera_world: Matrix, near_m: float) -> dict[str, float]:
-    """Return the scores of one view; shares in [0, 1], nan without pixels of their kind."""
-    seen = render(field, frame.camera, T_camera_world)
-    squared = (seen.color.clamp(0.0, 1.0).numpy() - frame.color) ** 2
+def seen(frame: Frame, T_world_camera: Matrix, recorded: Sequence[tuple[Frame, Matrix]]) -> NDArray[np.bool_]:
+    """Return which pixels [H, W] of a view show a surface that one of the recorded views shows too."""
+    camera, found = frame.camera, np.zeros(frame.depth_m.size, bool)
+    points = (camera.rays().astype(np.float64) * frame.depth_m[..., None]).reshape(-1, 3)
+    points = points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    for other, T in recorded:
+        x, y, z = ((points - T[:3, 3]) @ T[:3, :3]).T
+        rows = np.flatnonzero(~found & (z > 0.0))
+        u = np.rint(x[rows] / z[rows] * camera.fx + camera.cx)
+        v = np.rint(y[rows] / z[rows] * camera.fy + camera.cy)
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        rows, u, v = rows[inside], u[inside].astype(int), v[inside].astype(int)
+        found[rows] = np.abs(other.depth_m[v, u] - z[rows]) < SAME_SURFACE * z[rows]
+    return found.reshape(frame.depth_m.shape)
+
+
+def view_scores(
+    field: GaussianField, frame: Frame, T_camera_world: Matrix, near_m: float
+) -> tuple[NDArray[np.bool_], dict[str, float]]:
+    """Return the wrong pixels [H, W] of one view, and its scores: shares in [0, 1], nan without pixels of a kind."""
+    shown = render(field, frame.camera, T_camera_world)
+    squared = (shown.color.clamp(0.0, 1.0).numpy() - frame.color) ** 2
     wrong = np.sqrt(squared.mean(-1)) > WRONG
-    declared = 2.0 * seen.variance.mean(-1).clamp(min=0.0).sqrt().numpy() > WRONG
-    return {
+    declared = 2.0 * shown.variance.mean(-1).clamp(min=0.0).sqrt().numpy() > WRONG
+    return wrong, {
         "psnr_db": -10.0 * float(np.log10(squared.mean())),
         "wrong": float(wrong.mean()),
         "declared": float(declared[wrong].mean()) if wrong.any() else float("nan"),
