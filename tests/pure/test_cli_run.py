@@ -1,8 +1,10 @@
 """The command line end to end with a fake SLAM: files, output and exit codes, also of interrupted runs."""
 
 import io
+import itertools
 import json
 import os
+import re
 import signal
 import sys
 import time
@@ -510,6 +512,18 @@ def test_a_terminal_shows_progress_bars(corridor: Corridor) -> None:
         Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
     said = out.getvalue()
     assert "SLAM" in said and "6/6" in said and "final map" in said and "2/2" in said and "loop closed" in said
+
+
+def test_a_slow_run_says_seconds_per_frame_and_the_time_left(
+    corridor: Corridor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = itertools.count(0.0, 60.0)
+    monkeypatch.setattr("sigmasplat.run.terminal.time.perf_counter", lambda: next(now_s))
+    out, folder = io.StringIO(), RunFolder.create(Path("direct"), BASE, "corridor")
+    with Screen(Console(file=out, width=120)).steps(6) as callback:
+        Session(MadeUpSlam(BASE), corridor, folder, [callback]).execute()
+    minutes = [int(found) for found in re.findall(r"\d+\.\d s per frame, about (\d+) min left", out.getvalue())]
+    assert minutes and minutes == sorted(minutes, reverse=True) and "frames/s" not in out.getvalue()
 
 
 def test_unreadable_images_are_counted(corridor: Corridor, capsys: pytest.CaptureFixture[str]) -> None:

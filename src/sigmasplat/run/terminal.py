@@ -131,7 +131,7 @@ class _StepShow(Callback):
         self.show_final: Show | None = None
         self.final_from = 0, 0.0
         self.started_s = time.perf_counter()
-        self.done, self.lost, self.earlier = done, 0, done
+        self.done, self.lost, self.earlier, self.total = done, 0, done, total
         self.lost_since: int | None = None
         self.component = 0
 
@@ -141,9 +141,13 @@ class _StepShow(Callback):
         self._print_lost(step)
         self._print_component(step)
         self._print_loops(f"frame {step.index}", step.loops)
-        speed = (self.done - self.earlier) / max(time.perf_counter() - self.started_s, 1e-9)
+        frame_s = max(time.perf_counter() - self.started_s, 1e-9) / (self.done - self.earlier)
+        pace = f"{1.0 / frame_s:.1f} frames/s"
+        if frame_s > 1.0:  # presets of the papers
+            left_min = ((self.total or self.done) - self.done) * frame_s / 60.0
+            pace = f"{frame_s:.1f} s per frame" + (f", about {left_min:.0f} min left" if left_min > 1.0 else "")
         warning = "" if self.lost_since is None else f"LOST since frame {self.lost_since}  "
-        self.show(self.done, None, f"{warning}{speed:.1f} frames/s  {step.splats:,} splats  {self.lost} lost")
+        self.show(self.done, None, f"{warning}{pace}  {step.splats:,} splats  {self.lost} lost")
 
     def finishing(self, done: int, total: int) -> None:
         """Show the progress of the final map and the time left."""
