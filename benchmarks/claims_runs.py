@@ -101,8 +101,8 @@ def surface_figures(slam: Slam, done: FinishedRun, source: Source) -> dict[str, 
     opacities = slam.field.opacities.detach().numpy().astype(np.float64)
     keyframes = np.isin(own, slam.keyframe_indices)
     scores = score_splats(centers, opacities, surface.subdivided(0.2), slam.view.camera, T_true[keyframes])
-    return {"splats_chamfer_m": scores.splats_chamfer_m, "splats_accuracy_m": scores.splats_accuracy_m,
-            "floaters": scores.floaters}  # fmt: skip
+    return {"splats_chamfer_m": scores["splats_chamfer_m"], "splats_accuracy_m": scores["splats_accuracy_m"],
+            "floaters": scores["floaters"]}  # fmt: skip
 
 
 def hop_ranks(slam: Slam, source: Source) -> Rows:

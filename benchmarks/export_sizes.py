@@ -81,7 +81,7 @@ class HeldOutViews:
 
     def psnr_db(self, field: GaussianField) -> float:
         """Return the mean PSNR of a map over the views, as `sigmasplat eval` scores it."""
-        scores = view_scores.ViewScores(False)
+        scores = view_scores.ViewScores()
         for frame, T_camera_world in self.views:
             rendered = self.renderer(field, frame.camera, T_camera_world)
             scores.add(view_scores.scored_view(frame, rendered, view_scores.HELD_OUT))

@@ -34,10 +34,9 @@ from sigmasplat.final.tsdf import Tsdf, extract_surface
 from sigmasplat.input.source import Source
 from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     BEHIND_M,
-    CORRECT_M,
     SLACK_M,
+    correct,
     distances,
-    f1,
     visible_points,
 )
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid, ate, pair_poses
@@ -147,11 +146,9 @@ def scores(mesh: Mesh, reference: Reference, source: Source, T_truth_world: Matr
     ours = found.with_faces(seen)
     to_truth = distances(ours.sampled(POINTS, 0), reference.surface)
     to_found = distances(reference.surface.sampled(POINTS, 1), ours)
-    precision, recall = float((to_truth < CORRECT_M).mean()), float((to_found < CORRECT_M).mean())
     return {
-        "accuracy_m": float(to_truth.mean()), "completion_m": float(to_found.mean()), "precision": precision,
-        "recall": recall, "f1": f1(precision, recall), "far_share": float((to_truth > FAR_M).mean()),
-        "triangles": len(mesh.faces),
+        "accuracy_m": float(to_truth.mean()), "completion_m": float(to_found.mean()), **correct(to_truth, to_found),
+        "far_share": float((to_truth > FAR_M).mean()), "triangles": len(mesh.faces),
     }  # fmt: skip
 
 

@@ -77,10 +77,10 @@ def test_points_are_scored_as_by_brute_force() -> None:
     ours = ours.moved(aligned_by_icp(ours.vertices.astype(float), truth.vertices.astype(float)))
     a, b = ours.sampled(900, 4), truth.sampled(900, 5)
     there, back = nearest_by_brute_force(a, b), nearest_by_brute_force(b, a)
-    assert scores.accuracy_m == pytest.approx(there.mean()) and scores.completion_m == pytest.approx(back.mean())
-    assert scores.chamfer_m == pytest.approx((there.mean() + back.mean()) / 2)
-    assert scores.completion_ratio == pytest.approx((back < 0.05).mean())
-    assert np.isnan(scores.depth_l1_m) and scores.depth_views == 0
+    assert scores["accuracy_m"] == pytest.approx(there.mean()) and scores["completion_m"] == pytest.approx(back.mean())
+    assert scores["chamfer_m"] == pytest.approx((there.mean() + back.mean()) / 2)
+    assert scores["completion_ratio"] == pytest.approx((back < 0.05).mean())
+    assert np.isnan(scores["depth_l1_m"]) and scores["depth_views"] == 0
 
 
 def test_f1_equals_brute_force() -> None:
@@ -95,8 +95,8 @@ def test_f1_equals_brute_force() -> None:
     assert len(a) == len(b) == len(found.vertices)
     precision = (nearest_by_brute_force(a, b) < 0.01).mean()
     recall = (nearest_by_brute_force(b, a) < 0.01).mean()
-    assert 0.3 < precision < 0.99 and (scores.precision, scores.recall) == pytest.approx((precision, recall))
-    assert scores.f1 == pytest.approx(2 * precision * recall / (precision + recall))
+    assert 0.3 < precision < 0.99 and (scores["precision"], scores["recall"]) == pytest.approx((precision, recall))
+    assert scores["f1"] == pytest.approx(2 * precision * recall / (precision + recall))
     assert [len(points) for points in dense_points(truth, moved, 0)] == [len(found.vertices)] * 2
 
 

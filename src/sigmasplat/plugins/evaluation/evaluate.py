@@ -13,6 +13,7 @@ from sigmasplat.api import (
     FieldRenderer,
     FinalConfig,
     GaussianField,
+    Matrix,
     Mesh,
     Predicted,
     Progress,
@@ -33,7 +34,7 @@ from sigmasplat.plugins.evaluation import reconstruct, run_views, view_scores
 from sigmasplat.plugins.evaluation.failure import failure, scale_to_truth, wrong_scale
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS
-from sigmasplat.plugins.evaluation.metrics.trajectory import aligned_truth, score_path, truth_in_estimate
+from sigmasplat.plugins.evaluation.metrics.trajectory import associate, score_path, truth_in_estimate
 from sigmasplat.plugins.evaluation.path_scores import (
     arbitrary_scale,
     in_metres,
@@ -45,6 +46,7 @@ from sigmasplat.plugins.evaluation.path_scores import (
 from sigmasplat.plugins.evaluation.report import charts
 from sigmasplat.plugins.evaluation.report.page import report_plan, write_page
 from sigmasplat.plugins.evaluation.run_views import ViewScoring, ViewStrips
+from sigmasplat.plugins.evaluation.view_scores import ScoredView
 
 Log = list[dict[str, Any]]
 KINDS = {"held-out": False, "training": True}
@@ -103,8 +105,8 @@ def evaluate(
     metrics["test_views"] = None if scale else run_views.score_test_views(scoring, config.input, strips)
     run.write_metrics(metrics)
     plan = report_plan(run, path, source.camera) if standard else None
-    warnings, plots = [*alarms] + ([str(problem)] if problem else []), _draw_plots(run, frames, known, known is true)
-    write_page(run, metrics, strips.panels, plots, warnings, plan, frames)
+    plots = charts.run_charts(frames, _aligned_truth(run, path, known, aligned, known is true))
+    write_page(run, metrics, strips.panels, plots, [*alarms] + [str(problem)] * bool(problem), plan, frames)
     if problem:
         raise problem
     return metrics
@@ -202,27 +204,21 @@ def _score_views(
     the predictive variances. V is judged on held-out views, or on training views if every frame was mapped.
     """
     chosen, maps = scoring.chosen, scoring.maps
-    judged_on = "held-out" if chosen["held-out"] else "training"
-    scores = {kind: view_scores.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
-    before = {kind: view_scores.ViewScores(kind == judged_on, scoring.lpips) for kind in chosen}
     shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
-    for done, (view, in_submap) in enumerate(scoring.rendered(scoring.input), 1):
-        scores[view.kind].add(view)
+
+    def see(view: ScoredView, in_submap: ScoredView | None) -> None:
         predictions.add(view)
         if (view.kind, view.index) in shown:
             strips.add(view)
-        if in_submap:
-            before[view.kind].add(in_submap)
-            if view.kind == "held-out" and (view.kind, view.index) in shown:
+            if in_submap and view.kind == "held-out":
                 strips.add(in_submap, ", in their submaps")
-        progress(done, scoring.count)
-    kept = maps.T_world_submap is not None
+
+    both = scoring.scores(scoring.input, progress, see)
+    judged_on, kept = "held-out" if chosen["held-out"] else "training", maps.T_world_submap is not None
     # σ² of the final map is valid if it was learned during refinement too, or taken over from the submaps.
     keeps_variance = final.uncertainty if final.iterations else final.seed_from == "submaps"
-    judged, judged_before = (
-        view_scores.score_uncertainty(found[judged_on].samples, judged_on) for found in (scores, before)
-    )
-    return view_scores.kind_scores(scores, before, maps) | {
+    judged, judged_before = (view_scores.score_uncertainty(found[judged_on].samples, judged_on) for found in both)
+    return view_scores.kind_scores(*both, maps) | {
         "uncertainty": judged_before if kept else judged,
         "uncertainty_final": judged if kept and keeps_variance else None,
         "predictive": predictions.scores(),
@@ -247,17 +243,18 @@ def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> di
     }  # fmt: skip
 
 
-def _draw_plots(run: RunFolder, frames: RunFrames, truth: Trajectory | None, is_true: bool) -> dict[str, charts.Plot]:
-    """Return the charts of path and states by name, and write truth.txt if it is the truth."""
-    times, estimate = frames.path.timestamps_s, frames.path.T_world_camera[:, :3, 3]
-    known: NDArray[np.float64] | None = None
-    aligned: Trajectory | None = None
-    if truth is not None:
-        rows, aligned = aligned_truth(times, estimate, truth)
-        known = np.full_like(estimate, np.nan)
-        known[rows] = aligned.T_world_camera[:, :3, 3]
-    if aligned is None or not is_true:
-        (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
-    else:
-        write_trajectory(run.path / TRUTH, aligned)  # for the viewer
-    return charts.run_charts(frames, known)
+def _aligned_truth(
+    run: RunFolder, path: Trajectory, truth: Trajectory | None, T_estimate_truth: Matrix | None, is_true: bool
+) -> Matrix | None:
+    """Return the true positions of the valid frames in the world of the run [B, 3], nan if unknown, and write truth.txt
+    if it is the truth."""
+    (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
+    if truth is None or T_estimate_truth is None:
+        return None
+    rows, truth_rows = associate(path.timestamps_s, truth.timestamps_s)
+    T_world_camera = T_estimate_truth @ truth.T_world_camera[truth_rows]
+    if is_true:
+        write_trajectory(run.path / TRUTH, Trajectory(path.timestamps_s[rows], T_world_camera))  # for the viewer
+    known = np.full((len(path), 3), np.nan)
+    known[rows] = T_world_camera[:, :3, 3]
+    return known

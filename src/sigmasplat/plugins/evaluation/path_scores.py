@@ -141,7 +141,7 @@ def score_pose_covariance(run: RunFolder, frames: RunFrames, truth: Trajectory |
 def score_path_covariance(
     errors: PathCovariance, path: Trajectory, rows: NDArray[np.intp], keyframes: Iterable[int], truth: Trajectory
 ) -> dict[str, Any]:
-    """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`CovarianceScore`).
+    """Score motions from each keyframe to the next, over 50 frames, and from the first frame (`score_covariances`).
 
     path: poses of the valid frames; rows: their numbers [B]; keyframes: the numbers of all keyframes. Only frames with
     a true pose count. Motions do not depend on the world frame, so no alignment is needed. The truth's own error
@@ -166,8 +166,7 @@ def score_path_covariance(
         truths = trajectory.score_covariances(estimate, true, covariance + own + A @ own @ np.swapaxes(A, 1, 2))
         if score is None or truths is None:
             return None
-        beside = {f"{name}_with_truth": getattr(truths, name) for name in WITH_TRUTH} if own.any() else {}
-        return asdict(score) | beside
+        return score | ({f"{name}_with_truth": truths[name] for name in WITH_TRUTH} if own.any() else {})
 
     std_m, std_deg = (truth.error_rms[0], float(np.rad2deg(truth.error_rms[1]))) if truth.error_rms else (None, None)
     facts = {"window_frames": WINDOW_FRAMES, "truth_error_m": std_m, "truth_error_deg": std_deg}

@@ -5,7 +5,7 @@ keyframes.
 """
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -169,4 +169,4 @@ def score(
     opacities = field.opacities.numpy().astype(np.float64)
     of_splats = score_splats(centers, opacities, *reference, seen=(seen_true, seen_splats))
     published = score_published(found, truth, seen_true, seen_found, views=random_views, progress=progress)
-    return {"reconstruction": asdict(of_mesh) | asdict(of_splats), "reconstruction_published": asdict(published)}
+    return {"reconstruction": of_mesh | of_splats, "reconstruction_published": published}

@@ -3,7 +3,7 @@
 Scores at different resolutions are never mixed: each resolution has its own object in metrics.json.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -32,6 +32,7 @@ from sigmasplat.plugins.evaluation.metrics.trajectory import associate
 from sigmasplat.plugins.evaluation.view_scores import ScoredView
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, view_panels
 
+Scores = dict[str, view_scores.ViewScores]
 HEADINGS = {"test": "novel views"}
 """Headings of kinds of views; without an entry "<kind> views"."""
 
@@ -68,15 +69,25 @@ class ViewScoring:
     lpips: Lpips | None = None
     readouts: Mapping[int, Readout] = field(default_factory=dict)
 
-    @property
-    def count(self) -> int:
-        """Return the number of chosen views."""
-        return sum(len(records) for records in self.chosen.values())
-
-    def rendered(self, settings: InputConfig) -> Iterator[tuple[ScoredView, ScoredView | None]]:
-        """Render the chosen views at the size of `settings` (`view_scores.render_views`)."""
+    def scores(
+        self, settings: InputConfig, progress: Progress, see: Callable[[ScoredView, ScoredView | None], None] | None
+    ) -> tuple[Scores, Scores]:
+        """Render the chosen views at the size of `settings` (`view_scores.render_views`), and score them by kind, in
+        the final map and in their submaps. Calls `see` with both renders of a view, and `progress(done, total)`."""
+        final, before = ({kind: view_scores.ViewScores(self.lpips) for kind in self.chosen} for _ in range(2))
         read = partial(working_frame, self.source, settings, readouts=self.readouts)
-        return view_scores.render_views(read, self.maps, self.chosen, self.renderer)
+        views, total = (
+            view_scores.render_views(read, self.maps, self.chosen, self.renderer),
+            sum(map(len, self.chosen.values())),
+        )
+        for done, (view, in_submap) in enumerate(views, 1):
+            final[view.kind].add(view)
+            if in_submap:
+                before[view.kind].add(in_submap)
+            if see:
+                see(view, in_submap)
+            progress(done, total)
+        return final, before
 
 
 def full_width(config: Config, camera: Camera) -> int | None:
@@ -111,17 +122,12 @@ def score_full_resolution(
     width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
     if width is None:
         return None
-    scale, chosen = width / (scoring.input.width or scoring.source.camera.width), scoring.chosen
+    scale = width / (scoring.input.width or scoring.source.camera.width)
     settings = replace(scoring.input, width=width, crop_px=round(scoring.input.crop_px * scale))  # crops the same part
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
-    final, before = ({kind: view_scores.ViewScores(False, scoring.lpips) for kind in chosen} for _ in range(2))
     unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))
-    for done, (view, in_submap) in enumerate(unpredicted.rendered(settings), 1):
-        final[view.kind].add(view)
-        if in_submap:
-            before[view.kind].add(in_submap)
-        progress(done, scoring.count)
-    scores = view_scores.kind_scores(final, before, scoring.maps) | {"test_views": score_test_views(scoring, settings)}
+    scores = view_scores.kind_scores(*unpredicted.scores(settings, progress, None), scoring.maps)
+    scores |= {"test_views": score_test_views(scoring, settings)}
     return {"width": camera.width, "height": camera.height} | scores
 
 

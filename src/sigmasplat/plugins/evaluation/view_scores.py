@@ -106,10 +106,8 @@ uncertainty scores: sorting stays fast."""
 
 @dataclass(eq=False)
 class ViewScores:
-    """Scores of the views of one kind, with LPIPS if given. With `keep_samples`, pixels are sampled to score V over
-    all views."""
+    """Scores of the views of one kind, with LPIPS if given, and samples of their pixels to score V over all views."""
 
-    keep_samples: bool
     lpips: Lpips | None = None
     rows: list[dict[str, float]] = field(default_factory=list)
     samples: list[NDArray[np.float32]] = field(default_factory=list)
@@ -117,8 +115,7 @@ class ViewScores:
     def add(self, view: ScoredView) -> None:
         """Score a view."""
         self.rows.append(view.scores(self.lpips))
-        if self.keep_samples:
-            self.samples.append(sample_pixels(view))
+        self.samples.append(sample_pixels(view))
 
 
 @dataclass(frozen=True, eq=False)

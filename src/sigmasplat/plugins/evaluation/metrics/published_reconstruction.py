@@ -6,7 +6,6 @@ NICE-SLAM's random views inside the room. Distances are measured between points,
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,9 +15,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progress, se3
 from sigmasplat.plugins.evaluation.metrics.reconstruction import (
     COMPLETE_M,
-    CORRECT_M,
     POINTS,
-    f1,
+    correct,
     mean,
     nearest_m,
     share,
@@ -40,49 +38,31 @@ FACETS = 500
 """At most this many facets of the convex hull are tried as a side of the box."""
 
 
-@dataclass(frozen=True)
-class PublishedScores:
-    """Scores of a mesh: distances in metres, shares in [0, 1]; nan without data.
+def score_published(
+    found: Mesh, truth: Mesh, seen_true: Mask, seen_found: Mask, *, points: int = POINTS, views: int = VIEWS,
+    seed: int = 0, progress: Progress = no_progress,
+) -> dict[str, float]:  # fmt: skip
+    """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP: distances in
+    metres, shares in [0, 1]; nan without data.
 
     accuracy_m, completion_m: mean distance from points on the reconstruction to points on the truth, and back;
     chamfer_m: the mean of the two; completion_ratio: share of the true points within 5 cm; precision, recall, f1: as
     in the papers at 1 cm, with as many points as the larger mesh has vertices; depth_l1_m: mean over random views of
-    the mean |depth difference|; depth_views: number of these views.
-    """
-
-    accuracy_m: float
-    completion_m: float
-    chamfer_m: float
-    completion_ratio: float
-    precision: float
-    recall: float
-    f1: float
-    depth_l1_m: float
-    depth_views: int
-
-
-def score_published(
-    found: Mesh, truth: Mesh, seen_true: Mask, seen_found: Mask, *, points: int = POINTS, views: int = VIEWS,
-    seed: int = 0, progress: Progress = no_progress,
-) -> PublishedScores:  # fmt: skip
-    """Score mesh `found` against mesh `truth`, both in the frame of the truth, after aligning them by ICP.
-
-    seen_true, seen_found: the faces of each that count (`reconstruction.visible_parts`). Calls
-    `progress(views done, total)`.
+    the mean |depth difference|; depth_views: number of these views. seen_true, seen_found: the faces of each that count
+    (`reconstruction.visible_parts`). Calls `progress(views done, total)`.
     """
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     T = aligned_by_icp(ours.vertices.astype(np.float64), theirs.vertices.astype(np.float64))
     ours = ours.moved(T)
     ours_sampled, theirs_sampled = ours.sampled(points, seed), theirs.sampled(points, seed + 1)
     accuracy, completion = nearest_m(ours_sampled, theirs_sampled), nearest_m(theirs_sampled, ours_sampled)
-    ours_dense, theirs_dense = dense_points(ours, theirs, seed + 2)
-    precision = share(nearest_m(ours_dense, theirs_dense), CORRECT_M)
-    recall = share(nearest_m(theirs_dense, ours_dense), CORRECT_M)
+    dense = dense_points(ours, theirs, seed + 2)
     errors = depth_errors(ours, truth, seen_true, views=views, seed=seed, progress=progress)
-    return PublishedScores(
-        mean(accuracy), mean(completion), (mean(accuracy) + mean(completion)) / 2, share(completion, COMPLETE_M),
-        precision, recall, f1(precision, recall), mean(errors), len(errors),
-    )  # fmt: skip
+    return {
+        "accuracy_m": mean(accuracy), "completion_m": mean(completion),
+        "chamfer_m": (mean(accuracy) + mean(completion)) / 2, "completion_ratio": share(completion, COMPLETE_M),
+        **correct(nearest_m(*dense), nearest_m(*dense[::-1])), "depth_l1_m": mean(errors), "depth_views": len(errors),
+    }  # fmt: skip
 
 
 def dense_points(ours: Mesh, theirs: Mesh, seed: int) -> tuple[Matrix, Matrix]:

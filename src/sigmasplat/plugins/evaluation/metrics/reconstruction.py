@@ -4,8 +4,6 @@ Distances are measured from points sampled on one surface to the other *surface*
 samples of the same room with 200 000 points each are about a centimetre apart, more than the errors of a good map.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -24,28 +22,14 @@ SLACK_M, BEHIND_M = 0.005, 0.05
 this far behind the rendered depth. A reconstructed face more than this far behind the true surface is hidden."""
 
 
-@dataclass(frozen=True)
-class MeshScores:
-    """Scores of a mesh: distances in metres, shares in [0, 1].
-
-    accuracy_m: mean distance from the reconstruction to the true surface; completion_m: from the true surface to the
-    reconstruction; completion_ratio: share of the true surface within 5 cm of the reconstruction; precision, recall:
-    share of the reconstruction, and of the true surface, within 1 cm of the other; f1: their harmonic mean.
-    """
-
-    accuracy_m: float
-    completion_m: float
-    completion_ratio: float
-    precision: float
-    recall: float
-    f1: float
-
-
 def score(
     found: Mesh, truth: Mesh, camera: Camera, T_world_camera: Matrix, *, points: int = POINTS, seed: int = 0,
     seen: tuple[Mask, Mask] | None = None,
-) -> MeshScores:  # fmt: skip
+) -> dict[str, float]:  # fmt: skip
     """Score mesh `found` against mesh `truth`, both in the frame of the truth, as seen from true poses [K, 4, 4].
+
+    accuracy_m: mean distance from the reconstruction to the true surface; completion_m: from the true surface to the
+    reconstruction; completion_ratio: share of the true surface within 5 cm of the reconstruction; and `correct`.
 
     The true faces should be small (a few cm). A true face counts if a training view shows it at a pixel, or if its
     centre is at most `SLACK_M` behind the depth rendered there. A reconstructed face counts if its centre is in a
@@ -56,10 +40,8 @@ def score(
     ours, theirs = found.with_faces(seen_found), truth.with_faces(seen_true)
     to_truth = distances(ours.sampled(points, seed), theirs)
     to_found = distances(theirs.sampled(points, seed + 1), ours)
-    precision, recall = share(to_truth, CORRECT_M), share(to_found, CORRECT_M)
-    return MeshScores(
-        mean(to_truth), mean(to_found), share(to_found, COMPLETE_M), precision, recall, f1(precision, recall)
-    )
+    found_m = {"accuracy_m": mean(to_truth), "completion_m": mean(to_found)}
+    return found_m | {"completion_ratio": share(to_found, COMPLETE_M)} | correct(to_truth, to_found)
 
 
 def visible_parts(
@@ -80,9 +62,12 @@ def visible_parts(
     return seen_true, seen_points
 
 
-def f1(precision: float, recall: float) -> float:
-    """Return the harmonic mean; 0 if both are 0."""
-    return 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0 * (precision + recall)
+def correct(to_truth_m: Matrix, to_found_m: Matrix) -> dict[str, float]:
+    """Return precision and recall, the shares of the reconstruction and of the true surface within 1 cm of the other,
+    and f1, their harmonic mean; 0 if both are 0."""
+    precision, recall = share(to_truth_m, CORRECT_M), share(to_found_m, CORRECT_M)
+    both = precision + recall
+    return {"precision": precision, "recall": recall, "f1": 2 * precision * recall / both if both > 0 else 0.0 * both}
 
 
 def visible_points(
@@ -154,28 +139,16 @@ OPAQUE, FLOATER_M = 0.1, 0.1
 """A floater is a splat above this opacity whose centre is farther than this from every true surface."""
 
 
-@dataclass(frozen=True)
-class SplatScores:
-    """Scores of splat centres: distances in metres, shares in [0, 1]; nan or inf without data.
-
-    splats_accuracy_m: mean distance from a splat centre to the true surface; splats_completion_m: from the true
-    surface to the nearest splat centre; splats_chamfer_m: mean of the two; floaters: share of the opaque splats that
-    are floaters.
-    """
-
-    splats_accuracy_m: float
-    splats_completion_m: float
-    splats_chamfer_m: float
-    floaters: float
-
-
 def score_splats(
     centers: Matrix, opacities: Matrix, truth: Mesh, camera: Camera, T_world_camera: Matrix, *, points: int = POINTS,
     seed: int = 0, seen: tuple[Mask, Mask] | None = None,
-) -> SplatScores:  # fmt: skip
-    """Score splats, centers [N, 3] m and opacities [N], in the frame of the truth, as seen from true poses [K, 4, 4].
+) -> dict[str, float]:  # fmt: skip
+    """Score splats, centers [N, 3] m and opacities [N], in the frame of the truth, as seen from true poses [K, 4, 4];
+    nan or inf without data.
 
-    The Chamfer distance uses splats of every opacity, and only parts that a training view could see
+    splats_accuracy_m: mean distance from a splat centre to the true surface; splats_completion_m: from the true
+    surface to the nearest splat centre; splats_chamfer_m: mean of the two; floaters: share of the opaque splats that
+    are floaters. The Chamfer distance uses splats of every opacity, and only parts that a training view could see
     (`reconstruction.score`). It is never 0 because there are gaps between splat centres. Floaters are measured against
     the whole true surface, and splats hidden behind it count too. `seen`: the visible faces and splats, if known.
     """
@@ -183,7 +156,10 @@ def score_splats(
     theirs, ours = truth.with_faces(seen_true), centers[seen_splats]
     accuracy, completion = mean(distances(ours, theirs)), mean(nearest_m(theirs.sampled(points, seed), ours))
     floating = distances(centers[opacities > OPAQUE], truth) > FLOATER_M
-    return SplatScores(accuracy, completion, (accuracy + completion) / 2, mean(floating.astype(np.float64)))
+    return {
+        "splats_accuracy_m": accuracy, "splats_completion_m": completion,
+        "splats_chamfer_m": (accuracy + completion) / 2, "floaters": mean(floating.astype(np.float64)),
+    }  # fmt: skip
 
 
 def nearest_m(points: Matrix, among: Matrix) -> Matrix:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.stats import chi2, rankdata
+from scipy.stats import chi2, mannwhitneyu
 
 from sigmasplat.api import Matrix, SourceError, Trajectory, se3
 
@@ -24,16 +24,6 @@ class AbsoluteError:
     median_m: float
     max_m: float
     pairs: int
-
-
-@dataclass(frozen=True)
-class RelativeError:
-    """Error of the motion over `delta_frames` frames, metres and degrees: root mean square over `pairs` motions."""
-
-    translation_rmse_m: float
-    rotation_rmse_deg: float
-    pairs: int
-    delta_frames: int
 
 
 def align_rigid(estimate: Matrix, truth: Matrix) -> Matrix:
@@ -60,16 +50,6 @@ def align_similarity(estimate: Matrix, truth: Matrix) -> tuple[float, Matrix]:
     c = float(((centred @ T[:3, :3].T) * (truth - truth.mean(0))).sum()) / square if square > 0 else 1.0
     T[:3, 3] = truth.mean(0) - c * T[:3, :3] @ estimate.mean(0)
     return c, T
-
-
-def aligned_truth(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> tuple[Rows, Trajectory]:
-    """Return the rows of the frames with a true pose, and their true poses in the world of the estimate.
-
-    The rigid alignment is that of the ATE. times_s [N], s, and estimate [N, 3], m: of all frames.
-    """
-    rows, truth_rows = associate(times_s, truth.timestamps_s)
-    T_estimate_truth = truth_in_estimate(times_s, estimate, truth)
-    return rows, Trajectory(times_s[rows], T_estimate_truth @ truth.T_world_camera[truth_rows])
 
 
 def truth_in_estimate(times_s: Matrix, estimate: Matrix, truth: Trajectory) -> Matrix:
@@ -133,8 +113,9 @@ def absolute_error(estimate: Matrix, truth: Matrix) -> AbsoluteError:
     )  # fmt: skip
 
 
-def rpe(estimate: Trajectory, truth: Trajectory, delta_frames: int = 1) -> RelativeError:
-    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1), without alignment.
+def rpe(estimate: Trajectory, truth: Trajectory, delta_frames: int = 1) -> dict[str, float]:
+    """Measure the relative pose error over `delta_frames` paired frames (Sturm et al. 2012, eq. 1), without alignment:
+    root mean square over `pairs` motions, metres and degrees.
 
     With fewer than delta_frames + 1 pairs the errors are nan and pairs = 0. Raises SourceError if no timestamps match.
     """
@@ -144,8 +125,11 @@ def rpe(estimate: Trajectory, truth: Trajectory, delta_frames: int = 1) -> Relat
     error = se3.inverse(motion_theirs) @ motion_ours
     angles = np.array([se3.rotation_angle(E[:3, :3]) for E in error])
     shift = np.linalg.norm(error[:, :3, 3], axis=1)
-    rotation_deg = float(np.degrees(_root_mean_square(angles)))
-    return RelativeError(_root_mean_square(shift), rotation_deg, len(error), delta_frames)
+    return {
+        "translation_rmse_m": _root_mean_square(shift),
+        "rotation_rmse_deg": float(np.degrees(_root_mean_square(angles))),
+        "pairs": len(error), "delta_frames": delta_frames,
+    }  # fmt: skip
 
 
 def _root_mean_square(values: Matrix) -> float:
@@ -165,7 +149,7 @@ def score_path(
     if truth is None:
         return unknown, None
     try:
-        found = {"ate": asdict(ate(path, truth)), "rpe": asdict(rpe(path, truth))}
+        found = {"ate": asdict(ate(path, truth)), "rpe": rpe(path, truth)}
         return unknown | found | ({"ate_odometry": asdict(ate(odometry, truth))} if odometry else {}), None
     except SourceError as problem:
         return unknown, problem
@@ -203,11 +187,8 @@ def auroc(p: Values, off: Mask) -> float:
 
     Ties count one half. ½: p is random; nan if all or none are off.
     """
-    positive, negative = int(off.sum()), int((~off).sum())
-    if not positive or not negative:
-        return float("nan")
-    ranks = rankdata(p)[off].sum() - positive * (positive + 1) / 2.0
-    return float(ranks / (positive * negative))
+    pairs = int(off.sum()) * int((~off).sum())
+    return float(mannwhitneyu(p[off], p[~off]).statistic / pairs) if pairs else float("nan")
 
 
 def brier(p: Values, off: Mask) -> float:
@@ -228,27 +209,14 @@ LEVEL = 0.9
 """The coverage that is measured."""
 
 
-@dataclass(frozen=True)
-class CovarianceScore:
-    """How honest covariances are, over `count` errors.
+def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) -> dict[str, float] | None:
+    """Score how honest covariances [N, 6, 6] of the left twists (m, rad) of estimated poses or motions [N, 4, 4] are,
+    given the true ones; None without poses.
 
     NEES is eᵀ Σ⁻¹ e. If Σ is right, its mean is the number of components, 6 or 3, and `coverage_90` is 0.9: the share
     of errors inside the ellipsoid that should hold 90 %. `position_`: of the position alone. position_k: the median
     NEES of the position divided by its expected value 2.37, as in `smfeval`: the variances are k times too small.
     """
-
-    count: int
-    nees_mean: float
-    nees_median: float
-    coverage_90: float
-    position_nees_median: float
-    position_k: float
-    position_coverage_90: float
-
-
-def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) -> CovarianceScore | None:
-    """Score estimated poses or motions [N, 4, 4] against the true ones, given covariances [N, 6, 6] of the left twists
-    of the estimates (m, rad); None without poses."""
     if not len(T_estimate):
         return None
     twists = se3.log_stack(T_true @ se3.inverse(T_estimate))
@@ -256,10 +224,12 @@ def score_covariances(T_estimate: Matrix, T_true: Matrix, covariance: Matrix) ->
     shifts = T_true[:, :3, 3] - T_estimate[:, :3, 3]
     full, position = nees(twists, covariance), nees(shifts, J @ covariance @ np.swapaxes(J, 1, 2))
     median = float(np.median(position))
-    return CovarianceScore(
-        len(full), float(full.mean()), float(np.median(full)), float((full <= chi2.ppf(LEVEL, 6)).mean()), median,
-        median / float(chi2.ppf(0.5, 3)), float((position <= chi2.ppf(LEVEL, 3)).mean()),
-    )  # fmt: skip
+    return {
+        "count": len(full), "nees_mean": float(full.mean()), "nees_median": float(np.median(full)),
+        "coverage_90": float((full <= chi2.ppf(LEVEL, 6)).mean()), "position_nees_median": median,
+        "position_k": median / float(chi2.ppf(0.5, 3)),
+        "position_coverage_90": float((position <= chi2.ppf(LEVEL, 3)).mean()),
+    }  # fmt: skip
 
 
 def nees(errors: Matrix, covariance: Matrix) -> Matrix:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sigmasplat.api import APART, LOST, RELOCALISED, TRACKED, format_ranges, number, rate
+from sigmasplat.plugins.evaluation.path_scores import MOTIONS
 
 
 def key_figures(metrics: dict[str, Any]) -> list[tuple[str, str, str]]:
@@ -176,9 +177,7 @@ def _predictive_rows(scores: dict[str, Any] | None) -> list[list[str]]:
 
 
 def _covariance_rows(scores: dict[str, Any] | None) -> list[list[str]]:
-    columns = {"hops": "keyframe to keyframe", "windows": "50 frames", "from_start": "from the start"}
-    known = {name: (scores or {}).get(key) for key, name in columns.items()}
-    kinds = {name: found for name, found in known.items() if found}
+    kinds = {name: found for key, name in MOTIONS.items() if (found := (scores or {}).get(key))}
     if not kinds:
         return []
     own = "… with the truth's own error"
