@@ -11,7 +11,7 @@ from PIL import Image, ImageFont
 
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.plugins.evaluation.report import charts
-from sigmasplat.plugins.evaluation.report.page import Contents, address, build_report
+from sigmasplat.plugins.evaluation.report.page import address, build_report
 from sigmasplat.plugins.evaluation.report.summary import Verdict
 from sigmasplat.plugins.evaluation.report.tables import key_figures
 from sigmasplat.plugins.evaluation.view_scores import PredictedErrors, ScoredView
@@ -254,11 +254,10 @@ METRICS = {
 
 @pytest.mark.parametrize("metrics", [METRICS, {"frames": 0}], ids=["full", "bare"])
 def test_the_page_is_complete_and_needs_no_other_file(metrics: dict[str, object]) -> None:
-    contents = Contents(
+    page = build_report(
         "SigmaSplat · <room> & more", "fast", metrics, STRIPS, PLOTS,
         '{"name": "</pre><script>"}', ["estimate and truth share no timestamps"],
     )  # fmt: skip
-    page = build_report(contents)
     reader = Balance()
     reader.feed(page)
     assert not reader.wrong and not reader.open
@@ -289,8 +288,7 @@ class Tables(HTMLParser):
 def test_the_page_adapts_to_narrow_screens() -> None:
     """Tables scroll inside their cards, commands wrap, columns fit a phone, and charts are as wide as their column."""
     advice = [("Try this:", "sigmasplat run a-long-path")]
-    contents = Contents("t", "s", IN_SUBMAPS, STRIPS, PLOTS, advice=advice)
-    page = build_report(contents)
+    page = build_report("t", "s", IN_SUBMAPS, STRIPS, PLOTS, advice=advice)
     reader = Tables()
     reader.feed(page)
     assert len(reader.around) >= 4 and all("card" in classes for classes in reader.around)
@@ -303,7 +301,7 @@ def test_the_page_adapts_to_narrow_screens() -> None:
 
 
 def test_the_page_shows_the_measured_figures() -> None:
-    page = build_report(Contents("t", "s", METRICS))
+    page = build_report("t", "s", METRICS)
     text = re.sub("<[^>]+>", " ", page)
     for figure in ("1.23", "29.50", "31.25", "0.9500", "0.412", "123\u202f456", "3.21", "−2.500", "98.0"):
         assert figure in text, figure
@@ -317,7 +315,7 @@ IN_SUBMAPS = METRICS | {
 
 
 def test_scores_in_submaps_and_loops_are_shown() -> None:
-    text = " ".join(re.sub("<[^>]+>", " ", build_report(Contents("t", "s", IN_SUBMAPS))).split())
+    text = " ".join(re.sub("<[^>]+>", " ", build_report("t", "s", IN_SUBMAPS)).split())
     for figure in ("Submaps; loops accepted 8; 1 of 3", "12.5 s", "27.75", "26.50", "0.222"):
         assert figure in text, figure
 
@@ -347,9 +345,9 @@ def test_a_slow_speed_is_given_in_seconds_per_image() -> None:
 
 
 def test_the_time_of_the_final_map_is_shown() -> None:
-    figures = re.sub("<[^>]+>", " ", build_report(Contents("t", "s", METRICS | {"finish_s": 30.0, "total_s": 40.0})))
+    figures = re.sub("<[^>]+>", " ", build_report("t", "s", METRICS | {"finish_s": 30.0, "total_s": 40.0}))
     assert "Final map  30.0 s" in figures and "Frames and final map  40.0 s" in figures
-    assert "Final map" not in re.sub("<[^>]+>", " ", build_report(Contents("t", "s", METRICS | {"finish_s": None})))
+    assert "Final map" not in re.sub("<[^>]+>", " ", build_report("t", "s", METRICS | {"finish_s": None}))
 
 
 def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
@@ -357,8 +355,8 @@ def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
     (photo, render), shown = map(address, views[1][:2]), r"src='(data:[^']*)'"
     verdicts = [Verdict("Path", "All 3 images", "No image is <lost>."), Verdict("Next", "Try", "Smaller:", "run --x")]
     page = build_report(
-        Contents("t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, PLOTS,
-                 '{"a": 1}', ["careful"], verdicts=verdicts, commands=[("View it:", "sigmasplat view r")])
+        "t", "s", METRICS, {"held-out views": [STRIPS["held-out views"][0], *views]}, PLOTS,
+        '{"a": 1}', ["careful"], judged=verdicts, commands=[("View it:", "sigmasplat view r")],
     )  # fmt: skip
     opened = page[page.index("<main>") : page.index("<details")]
     assert re.findall(shown, opened) == [render, photo] and render != photo, "the map, then the photo"
@@ -368,6 +366,6 @@ def test_the_map_and_the_verdicts_come_first_and_the_rest_is_folded() -> None:
     titles = re.findall(r"<details class=part><summary><h2>(.*?)</h2>", folded)
     assert titles == ["Trajectory", "Views", "Scores", "Settings (config.json)"]
     assert page.count("<h2>") == len(titles)
-    page = build_report(Contents("t", "s", METRICS, plan=[plain("What is there", 7)]))
+    page = build_report("t", "s", METRICS, plan=[plain("What is there", 7)])
     drawn = address(plain("What is there", 7))
     assert drawn in page[: page.index("<details")], "without a view the floor plan is shown"

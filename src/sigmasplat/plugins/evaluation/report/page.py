@@ -8,8 +8,9 @@ import html
 import io
 import json
 import shlex
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from sigmasplat.api import (
@@ -29,7 +30,7 @@ from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice, advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
 from sigmasplat.plugins.evaluation.report.summary import Verdict, verdicts
-from sigmasplat.plugins.outputs.drawing.plot import svg
+from sigmasplat.plugins.outputs.drawing.plot import Chart, svg
 from sigmasplat.plugins.outputs.drawing.view_panels import PANEL_WIDTH, ViewPanel
 from sigmasplat.plugins.outputs.floorplan.floor_plan import FloorPlan, run_floor_plan
 from sigmasplat.plugins.outputs.floorplan.picture import plan_panels
@@ -51,13 +52,12 @@ def write_page(
     found += advice(metrics, rerun_command(config, facts), config.to_dict())
     machine, times = f"{made_on.get('cpu')}, {made_on.get('cores')} cores", sensor_said(facts)
     about = [config.name, f"version {facts.get('version')}", machine, str(facts.get("status")), times]
-    contents = Contents(
+    page = build_report(
         f"SigmaSplat · {metrics.get('source')}", " · ".join(filter(None, about)), metrics, strips, plots,
-        config=json.dumps(config.to_dict(), indent=2), warnings=warnings, verdicts=verdicts(metrics, unsure, found),
-        commands=next_commands(str(run.path)), advice=found[1:], plan=plan_panels(plan) if plan else [],
-        origins=facts.get("origins") or {},
+        json.dumps(config.to_dict(), indent=2), warnings, verdicts(metrics, unsure, found),
+        next_commands(str(run.path)), found[1:], plan_panels(plan) if plan else [], facts.get("origins") or {},
     )  # fmt: skip
-    run.write_report(build_report(contents))
+    run.write_report(page)
 
 
 def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan | None:
@@ -97,70 +97,52 @@ PLAN_CAPTION = (
 )
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a report shows.
+Strips = Mapping[str, Sequence[Sequence[ViewPanel]]]
+NONE: Mapping[str, Any] = MappingProxyType({})
 
-    verdicts: shown first; commands: what to do with the map; advice: what else to try; strips: panels of views by
-    heading; plots: charts by name; plan: panels of the floor plan; origins: of the values that decide the result.
+
+def build_report(
+    title: str, subtitle: str, metrics: dict[str, Any], strips: Strips = NONE, plots: Mapping[str, Plot] = NONE,
+    config: str = "", warnings: Sequence[str] = (), judged: Sequence[Verdict] = (), commands: Sequence[Advice] = (),
+    advice: Sequence[Advice] = (), plan: Sequence[ViewPanel] = (), origins: Mapping[str, dict[str, str]] = NONE,
+) -> str:  # fmt: skip
+    """Return the whole page as HTML. `metrics` is what `evaluate` returns; absent values show as a dash.
+
+    judged: verdicts, shown first; commands: what to do with the map; advice: what else to try; strips: panels of views
+    by heading; plots: charts by name; plan: panels of the floor plan; origins: of the values that decide the result.
     """
-
-    title: str
-    subtitle: str
-    metrics: dict[str, Any]
-    strips: dict[str, list[list[ViewPanel]]] = field(default_factory=dict)
-    plots: dict[str, Plot] = field(default_factory=dict)
-    config: str = ""
-    warnings: list[str] = field(default_factory=list)
-    verdicts: list[Verdict] = field(default_factory=list)
-    commands: list[Advice] = field(default_factory=list)
-    advice: list[Advice] = field(default_factory=list)
-    plan: list[ViewPanel] = field(default_factory=list)
-    origins: dict[str, dict[str, str]] = field(default_factory=dict)
-
-
-def build_report(contents: Contents) -> str:
-    """Return the whole page as HTML. `metrics` is what `evaluate` returns; absent values show as a dash."""
+    trajectory, states = (_figure(*plots[name]) if name in plots else "" for name in ("trajectory", "states"))
+    from_above = f"{_view(plan)}<p class=soft>{PLAN_CAPTION}</p>" if plan else ""
+    given = [[name, o["value"], o["origin"], o["option"]] for name, o in origins.items()]
+    scores = (_card(rows, name) for name, rows in tables.score_tables(metrics) if rows[1:])
+    folded = {
+        "What else to try": _advice(advice), "Floor plan": from_above, "Trajectory": trajectory,
+        "States of the frames": states and states + _card(tables.state_rows(metrics)), "Views": _strips(strips),
+        "Scores": f"<div class=pair>{''.join(scores)}</div>",
+        "Given, read, measured or assumed": given and _card([["what", "value", "origin", "what changes it"], *given]),
+        "Settings (config.json)": config and f"<pre>{html.escape(config)}</pre>",
+    }  # fmt: skip
     parts = [
-        f"<h1>{html.escape(contents.title)}</h1><p class=soft>{html.escape(contents.subtitle)}</p>",
-        "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in contents.warnings),
-        _map(contents),
-        f"<div class=judged>{''.join(map(_verdict, contents.verdicts))}</div>",
-        _advice(contents.commands),
-        _part("What else to try", _advice(contents.advice)),
-        _part("Floor plan", _plan(contents)),
-        _part("Trajectory", _figure(contents, "trajectory")),
-        _part("States of the frames", _states(contents)),
-        _part("Views", _strips(contents)),
-        _part("Scores", _scores(contents)),
-        _part("Given, read, measured or assumed", _origins(contents.origins)),
-        _part("Settings (config.json)", contents.config and f"<pre>{html.escape(contents.config)}</pre>"),
-    ]
+        f"<h1>{html.escape(title)}</h1><p class=soft>{html.escape(subtitle)}</p>",
+        "".join(f"<p class=alarm>{html.escape(warning)}</p>" for warning in warnings),
+        _map(strips) or from_above, f"<div class=judged>{''.join(map(_verdict, judged))}</div>", _advice(commands),
+        *(f"<details class=part><summary><h2>{name}</h2></summary>{body}</details>" if body else ""
+          for name, body in folded.items()),
+    ]  # fmt: skip
     head = "<meta charset=utf-8><meta name=viewport content='width=device-width, initial-scale=1'>"
-    title, body = html.escape(contents.title), "\n".join(parts)
+    body = "\n".join(parts)
     return (
-        f"<!doctype html>\n<html lang=en>{head}<title>{title}</title><style>{STYLE}</style>\n"
+        f"<!doctype html>\n<html lang=en>{head}<title>{html.escape(title)}</title><style>{STYLE}</style>\n"
         f"<main>\n{body}\n</main></html>\n"
     )
 
 
-def _part(title: str, body: str) -> str:
-    """Return a folded part of the page; nothing if it is empty."""
-    return f"<details class=part><summary><h2>{title}</h2></summary>{body}</details>" if body else ""
-
-
-def _origins(origins: dict[str, dict[str, str]]) -> str:
-    """Show where the values come from that decide the result; what is assumed, with the option that changes it."""
-    rows = [[name, o["value"], o["origin"], o["option"]] for name, o in origins.items()]
-    return f"<div class=card>{_table([['what', 'value', 'origin', 'what changes it'], *rows])}</div>" if rows else ""
-
-
-def _map(contents: Contents) -> str:
-    """Show the map from the place of a recorded image, and that image; without one, the floor plan."""
-    views = next((found for found in contents.strips.values() if found), [])
+def _map(strips: Strips) -> str:
+    """Show the map from the place of a recorded image, and that image."""
+    views = next((found for found in strips.values() if found), ())
     views = [panels for panels in views if len(panels) == VIEW_PANELS] or views
     if not views:
-        return _plan(contents)
+        return ""
     recorded, *rendered = views[len(views) // 2][:2]
     shown = [(panel, "The map") for panel in rendered] + [(recorded, "The recorded image")]
     figures = (
@@ -177,17 +159,7 @@ def _verdict(verdict: Verdict) -> str:
     return f"<div class=card><span class=soft>{about}</span><b>{words}</b><p>{meaning}</p>{shown}</div>"
 
 
-def _scores(contents: Contents) -> str:
-    """Show all scores of images, path, surface and uncertainty."""
-    body = "".join(
-        f"<div class=card><h3>{title}</h3>{_table(rows)}</div>"
-        for title, rows in tables.score_tables(contents.metrics)
-        if rows[1:]
-    )
-    return f"<div class=pair>{body}</div>"
-
-
-def _advice(advice: list[Advice]) -> str:
+def _advice(advice: Sequence[Advice]) -> str:
     if not advice:
         return ""
     items = [
@@ -197,9 +169,9 @@ def _advice(advice: list[Advice]) -> str:
     return f"<ul>{''.join(items)}</ul>"
 
 
-def _strips(contents: Contents) -> str:
+def _strips(strips: Strips) -> str:
     """Show the views of each kind, each as a row of panels that wraps on narrow pages."""
-    if not any(contents.strips.values()):
+    if not any(strips.values()):
         return ""
     parts = [
         "<p class=soft>Images are rendered at the estimated poses. The map predicts V, the variance of colour along "
@@ -207,14 +179,14 @@ def _strips(contents: Contents) -> str:
         "the error well. If the run has predicted errors, held-out views show them instead, one standard deviation "
         "in the colours of the error. Slate pixels: no depth reading, or no surface in the map.</p>"
     ]
-    for kind, strips in contents.strips.items():
-        if strips:
+    for kind, views in strips.items():
+        if views:
             parts.append(f"<h3>{html.escape(kind)}</h3>")
-            parts += map(_view, strips)
+            parts += map(_view, views)
     return "".join(parts)
 
 
-def _view(panels: list[ViewPanel]) -> str:
+def _view(panels: Sequence[ViewPanel]) -> str:
     """Show the panels of a view. With five of them, the image and its render are half as wide as the page."""
     large = " large" if len(panels) == VIEW_PANELS else ""
     return f"<figure class='view{large}'>{''.join(map(_panel, panels))}</figure>"
@@ -242,28 +214,15 @@ def _panel(panel: ViewPanel) -> str:
     return f"<div>{title}<img src='{address(panel)}' alt='{title}'>{below}</div>"
 
 
-def _states(contents: Contents) -> str:
-    if "states" not in contents.plots:
-        return ""
-    table = f"<div class=card>{_table(tables.state_rows(contents.metrics))}</div>"
-    return f"{_figure(contents, 'states')}{table}"
-
-
-def _figure(contents: Contents, name: str) -> str:
-    """Show the charts of a plot and its caption; nothing if there is no such plot."""
-    if name not in contents.plots:
-        return ""
-    charts, caption = contents.plots[name]
+def _figure(charts: Sequence[Chart], caption: str) -> str:
+    """Show the charts of a plot and its caption."""
     drawn = "".join(map(svg, charts))
     return f"<figure><div class=pair>{drawn}</div><figcaption>{html.escape(caption)}</figcaption></figure>"
 
 
-def _plan(contents: Contents) -> str:
-    return f"{_view(contents.plan)}<p class=soft>{PLAN_CAPTION}</p>" if contents.plan else ""
-
-
-def _table(rows: list[list[str]]) -> str:
+def _card(rows: list[list[str]], title: str = "") -> str:
     """Return a table of text; the first row is the head."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in rows[0])
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows[1:])
-    return f"<table><tr>{head}</tr>{body}</table>"
+    name = f"<h3>{title}</h3>" if title else ""
+    return f"<div class=card>{name}<table><tr>{head}</tr>{body}</table></div>"
