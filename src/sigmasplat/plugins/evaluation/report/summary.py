@@ -27,9 +27,9 @@ def verdicts(metrics: Metrics, unsure: Sequence[int], advice: Sequence[Advice]) 
     """
     words, command = advice[0] if advice else ("The checks of the report found nothing to repair.", "")
     todo = Verdict("Next", "Try this" if advice else "Use the map", words, command)
-    meaning = "" if metrics.get("failure") else " ".join([*_images(metrics), *_depth(metrics)])
+    meaning = "" if metrics.get("failure") else _map(metrics)
     known = f"{path_words(metrics)}, {len(unsure)} of them doubtful" if unsure else path_words(metrics)
-    path = " ".join([_path(metrics, unsure) + _continued(metrics), *_pose_covariance(metrics)])
+    path = _path(metrics, unsure) + _continued(metrics) + _pose_covariance(metrics)
     return [Verdict("Path", known, path), Verdict("Map", map_words(metrics), meaning), todo]
 
 
@@ -74,7 +74,7 @@ def _path(metrics: Metrics, unsure: Sequence[int]) -> str:
     """Return where the path is not sure, and its error if the true path is known."""
     ate = metrics.get("device_path") or metrics.get("ate") or {}
     doubtful = f" Probably off by more than 5 cm: images {format_ranges([*unsure])}." if unsure else ""
-    tracked = f"{_tracked(metrics)}{_apart_sentence(metrics)}{doubtful}"
+    tracked = f"{_tracked(metrics)}{doubtful}"
     if ate.get("rmse_m") is None:
         return f"{tracked} The error of the path is unknown, because the recording has no ground truth."
     before = (metrics.get("ate_odometry") or {}).get("rmse_m")
@@ -96,64 +96,51 @@ def _compared(ate: Metrics) -> str:
 
 
 def _tracked(metrics: Metrics) -> str:
-    """Return whether tracking was lost, and where it found its place again in the map."""
+    """Return whether tracking was lost, where it found its place again in the map, and which images are apart."""
     lost, again = metrics.get("lost") or 0, format_ranges(metrics.get("relocalised_frames") or [])
+    found = f" It found its place in the map again at image {again}." if again else ""
+    words = f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose.{found}"
     if not lost:
         found = f"No image was lost, but tracking had to find its place in the map again at image {again}."
-        return found if again else "Tracking was never lost."
-    found = f" It found its place in the map again at image {again}." if again else ""
-    return f"Tracking was lost on {lost} of {metrics.get('frames')} images, which have no pose.{found}"
-
-
-def _apart_sentence(metrics: Metrics) -> str:
+        words = found if again else "Tracking was never lost."
     apart, components = metrics.get("apart") or 0, len(metrics.get("components") or [])
-    if not apart:
-        return ""
     maps = "a map of their own" if components == 1 else f"{components} maps of their own"
-    return f" {apart} images are in {maps}, which could not be connected to the first one (components/)."
+    sentence = f" {apart} images are in {maps}, which could not be connected to the first one (components/)."
+    return words + sentence * bool(apart)
 
 
-def _images(metrics: Metrics) -> list[str]:
-    """Return which images the words about the map are from."""
-    if (metrics.get("held_out") or {}).get("psnr_db") is not None:
-        return ["Compared with images that the map was not made from."]
-    known = (metrics.get("training") or {}).get("psnr_db") is not None
-    return ["Compared with images that the map was made from, because none was held back."] if known else []
+def _map(metrics: Metrics) -> str:
+    """Return which images the words about the map are from, and how good its depth is."""
+    held_out, words = metrics.get("held_out") or {}, list[str]()
+    if held_out.get("psnr_db") is not None:
+        words.append("Compared with images that the map was not made from.")
+    elif (metrics.get("training") or {}).get("psnr_db") is not None:
+        words.append("Compared with images that the map was made from, because none was held back.")
+    if (error_m := held_out.get("depth_l1_m")) is not None:
+        rating = next((words for most, words in DEPTH_WORDS if error_m <= most), "coarse")
+        error = f"{number(error_m, 1, 100.0)} cm on average: {rating}."
+        words.append(f"The depth of the map differs from the measured depth by {error}")
+        holes = 1.0 - (held_out.get("depth_coverage") or 0.0)
+        if holes > 0.02:
+            words.append(f"{number(holes, 0, 100.0)} % of the depth readings have no surface in the map.")
+    return " ".join(words)
 
 
-def _depth(metrics: Metrics) -> list[str]:
-    held_out = metrics.get("held_out") or {}
-    if held_out.get("depth_l1_m") is None:
-        return []
-    holes = 1.0 - (held_out.get("depth_coverage") or 0.0)
-    missing = f" {number(holes, 0, 100.0)} % of the depth readings have no surface in the map." if holes > 0.02 else ""
-    error_m = held_out["depth_l1_m"]
-    rating = next((words for most, words in DEPTH_WORDS if error_m <= most), "coarse")
-    return [
-        f"The depth of the map differs from the measured depth by {number(error_m, 1, 100.0)} cm on average: {rating}."
-        f"{missing}"
-    ]
-
-
-def _pose_covariance(metrics: Metrics) -> list[str]:
+def _pose_covariance(metrics: Metrics) -> str:
+    """Return whether the covariance of poses has the right size; also with the truth's own error, if it is known."""
     covariance = metrics.get("pose_covariance") or {}
     found = covariance.get("windows")
     if not found:
-        return []
+        return ""
     off, factor = found["position_coverage_90"] - 0.9, found.get("position_k")
     size = "has the right size" if abs(off) <= CALIBRATED else f"is too {'small' if off < 0 else 'large'}"
     by = "" if factor is None or abs(off) <= CALIBRATED else f", in this recording by a factor of {number(factor, 1)}"
-    return [
-        f"90 % of the position errors over {covariance['window_frames']} frames should be within the covariance of the "
-        f"poses: measured {number(found['position_coverage_90'], 0, 100.0)} %. It {size}{by}.",
-        *_with_truth(covariance, found),
-    ]
-
-
-def _with_truth(covariance: Metrics, found: Metrics) -> list[str]:
-    """Return the share within the covariance of poses and truth together, if the truth's own error is known."""
+    words = (
+        f" 90 % of the position errors over {covariance['window_frames']} frames should be within the covariance of "
+        f"the poses: measured {number(found['position_coverage_90'], 0, 100.0)} %. It {size}{by}."
+    )
     share = found.get("position_coverage_90_with_truth")
     if share is None:
-        return []
+        return words
     own = f"{number(covariance['truth_error_m'], 0, 1e3)} mm and {number(covariance['truth_error_deg'], 1)}° a pose"
-    return [f"With the own error of the true path, {own}, {number(share, 0, 100.0)} % are within."]
+    return f"{words} With the own error of the true path, {own}, {number(share, 0, 100.0)} % are within."

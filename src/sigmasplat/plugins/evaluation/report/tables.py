@@ -49,11 +49,16 @@ def figure_rows(lines: Lines, *columns: Mapping[str, Any]) -> list[list[str]]:
 def score_tables(metrics: dict[str, Any]) -> list[tuple[str, list[list[str]]]]:
     """Return the tables of scores with their titles. A table without figures has at most a head."""
     kind = (metrics.get("uncertainty") or {}).get("judged_on", "held-out")
+    sharp = (metrics.get("full_resolution") or {}) and metrics["full_resolution"] | {
+        "lpips_network": metrics.get("lpips_network")
+    }
     views = f"{kind}, in submaps" if metrics.get("held_out_submaps") else kind
     return [
         ("Run", _run_rows(metrics)),
         ("Rendered images", _image_rows(metrics)),
-        _full_resolution_table(metrics),
+        ("Rendered images, full resolution: {width} × {height}".format(**sharp), _image_rows(sharp))
+        if sharp
+        else ("", []),
         ("Path", _path_rows(metrics)),
         ("Surface", _column(metrics, "reconstruction", RUN_SURFACE)),
         ("Surface, by the protocol of published systems", _column(metrics, "reconstruction_published", PUBLISHED)),
@@ -91,47 +96,36 @@ def _image_rows(metrics: dict[str, Any]) -> list[list[str]]:
     return [["", *columns], *figure_rows(lines, *kinds)]
 
 
-def _full_resolution_table(metrics: dict[str, Any]) -> tuple[str, list[list[str]]]:
-    found = metrics.get("full_resolution")
-    if not found:
-        return "", []
-    rows = _image_rows(found | {"lpips_network": metrics.get("lpips_network")})
-    return f"Rendered images, full resolution: {found['width']} × {found['height']}", rows
-
-
 def _path_rows(metrics: dict[str, Any]) -> list[list[str]]:
     ate, rpe = metrics.get("ate"), metrics.get("rpe")
     if not ate or not rpe:
         return []
-    rows = [[f"ATE {name}, cm", number(ate[f"{name}_m"], 3, 100.0)] for name in ("rmse", "mean", "median", "max")]
+    rows = figure_rows([(f"ATE {kind}, cm", f"{kind}_m", 3, 100.0) for kind in ("rmse", "mean", "median", "max")], ate)
     kinds = {"keyframes": metrics.get("ate_keyframes"), "all frames, with lost ones": metrics.get("ate_all_frames")}
     for kind, found in kinds.items():
         if found and found["pairs"] != ate["pairs"]:
             rows.append([f"ATE rmse of {kind} ({found['pairs']} poses), cm", number(found["rmse_m"], 3, 100.0)])
-    factor, without = metrics.get("path_scale"), metrics.get("ate_odometry")
-    alignment = f"aligned with scale factor {number(factor, 3)}" if factor else "rigid alignment"
-    if without:
+    if without := metrics.get("ate_odometry"):
         rows.append(["ATE rmse without loop closure, cm", number(without["rmse_m"], 3, 100.0)])
-    return [
-        [f"valid frames, {alignment}", f"{ate['pairs']} poses"], *rows,
-        ["RPE translation, cm per frame", number(rpe["translation_rmse_m"], 3, 100.0)],
-        ["RPE rotation, ° per frame", number(rpe["rotation_rmse_deg"], 3)], *_failure_rows(metrics),
-    ]  # fmt: skip
+    rows += figure_rows(RELATIVE, rpe)
+    if failures := metrics.get("failures"):
+        off = f"{number(failures['off'], 0)} of {number(failures['frames'], 0)}"
+        silent, *others = figure_rows(FAILURES, failures)
+        rows += [silent, ["frames off by > 5 cm, with lost ones", off], *others]
+    factor = metrics.get("path_scale")
+    alignment = f"aligned with scale factor {number(factor, 3)}" if factor else "rigid alignment"
+    return [[f"valid frames, {alignment}", f"{ate['pairs']} poses"], *rows]
 
 
-def _failure_rows(metrics: dict[str, Any]) -> list[list[str]]:
-    """Return how honest the run is about its path: silent failures, and scores of the predicted probability."""
-    found = metrics.get("failures")
-    if not found:
-        return []
-    return [
-        ["silent failures: valid, but off by > 10 cm", number(found["silent"], 0)],
-        ["frames off by > 5 cm, with lost ones", f"{number(found['off'], 0)} of {number(found['frames'], 0)}"],
-        ["AUROC of the probability of > 5 cm", number(found["auroc"], 3)],
-        ["Brier score of it", number(found["brier"], 4)],
-    ]
-
-
+RELATIVE = (
+    ("RPE translation, cm per frame", "translation_rmse_m", 3, 100.0),
+    ("RPE rotation, ° per frame", "rotation_rmse_deg", 3, 1.0),
+)
+FAILURES = (
+    ("silent failures: valid, but off by > 10 cm", "silent", 0, 1.0),
+    ("AUROC of the probability of > 5 cm", "auroc", 3, 1.0), ("Brier score of it", "brier", 4, 1.0),
+)  # fmt: skip
+"""How honest the run is about its path: silent failures, and scores of the predicted probability."""
 SURFACE = (
     ("Accuracy, cm", "accuracy_m", 2, 100.0), ("Completion, cm", "completion_m", 2, 100.0),
     ("Completion ratio (< 5 cm), %", "completion_ratio", 1, 100.0), ("Precision (< 1 cm), %", "precision", 1, 100.0),
