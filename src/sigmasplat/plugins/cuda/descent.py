@@ -30,7 +30,7 @@ from sigmasplat.api import (
     parametrisation,
     tracking_params,
 )
-from sigmasplat.plugins.cuda.launch import THREADS, blocks_for
+from sigmasplat.plugins.cuda.launch import THREADS, HostCopy, blocks_for
 from sigmasplat.plugins.cuda.view import CudaView
 
 Work = Callable[[], None]
@@ -164,21 +164,25 @@ class CudaDescent:
     def run(self, iterations: int) -> Descent:
         """Take at most this many steps. If there is not enough memory for all pairs, allocate more and continue from
         the step that was not taken."""
-        work, left, at_once, look = self.iterate, iterations, 1, _Look(self._state)
+        work, left, at_once, look = self.iterate, iterations, 1, HostCopy(self._state)
         while left:
             for _ in range(min(at_once, left)):
                 work()
             left -= min(at_once, left)
-            earlier, look, at_once = look, _Look(self._state), LOOK
-            seen = (earlier if left else look).read()
+            earlier, look, at_once = look, HostCopy(self._state), LOOK
+            seen = _state_of(earlier if left else look)
             if seen["stopped"]:
                 break
             if seen["missing"]:
-                left, look = self._make_room(iterations)
-                work = self.iterate
+                now = _state_of(HostCopy(self._state))
+                self.view.raster.expect(int(now["missing"]))
+                self._state[-1] = 0
+                work, left, look = self.iterate, iterations - int(now["steps"]), HostCopy(self._state)
             if work == self.iterate and self.config.cuda_graphs and left >= GRAPH_FROM:
                 work = repeatable(self.iterate, self.view.alpha.device)
-        return _found(look.read())
+        state = _state_of(look)
+        T, (a, b) = np.vstack([state["best_T"], [0.0, 0.0, 0.0, 1.0]]), state["best_exposure"].tolist()
+        return Descent(T, (a, b), float(state["first"]), float(state["best"]), int(state["steps"]))
 
     def iterate(self) -> None:
         """Launch one iteration."""
@@ -190,31 +194,11 @@ class CudaDescent:
             self.view.raster.pairs,
         )  # fmt: skip
 
-    def _make_room(self, iterations: int) -> "tuple[int, _Look]":
-        """Allocate memory for the missing pairs; return the number of remaining steps."""
-        now = _Look(self._state).read()
-        self.view.raster.expect(int(now["missing"]))
-        self._state[-1] = 0
-        return iterations - int(now["steps"]), _Look(self._state)
 
-
-class _Look:
-    """A copy of the descent's state to the host, made at this point of the device's queue; the host does not wait."""
-
-    def __init__(self, state: Tensor) -> None:
-        self._on_host = torch.empty(state.shape, dtype=state.dtype, pin_memory=state.is_cuda)
-        self._on_host.copy_(state, non_blocking=state.is_cuda)
-        self._copied: torch.cuda.Event | None = None
-        if state.is_cuda:
-            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._copied.record(torch.cuda.current_stream(state.device))
-
-    def read(self) -> np.void:
-        """Return the state as a `STATE`. Waits until the copy has finished."""
-        if self._copied is not None:
-            self._copied.synchronize()
-        state: np.void = np.frombuffer(self._on_host.numpy().tobytes(), STATE)[0]
-        return state
+def _state_of(copied: HostCopy) -> np.void:
+    """Return the descent's state as a `STATE`. Waits until the copy has finished."""
+    state: np.void = np.frombuffer(copied.read().tobytes(), STATE)[0]
+    return state
 
 
 def _at_rest(T_camera_world: Matrix, config: TrackingConfig) -> NDArray[np.void]:
@@ -236,8 +220,3 @@ def _settings(T_camera_world: Matrix, config: TrackingConfig) -> Matrix:
     rates = [c.lr_rotation, c.lr_translation, exposure_rate(c)]
     stops = [0.0, c.plateau_stop, c.plateau_window]  # no step is so small that the descent ends
     return np.array([*T_camera_world[:3].ravel(), BETA1, BETA2, EPSILON, *rates, *stops], np.float64)
-
-
-def _found(state: np.void) -> Descent:
-    T, (a, b) = np.vstack([state["best_T"], [0.0, 0.0, 0.0, 1.0]]), state["best_exposure"].tolist()
-    return Descent(T, (a, b), float(state["first"]), float(state["best"]), int(state["steps"]))

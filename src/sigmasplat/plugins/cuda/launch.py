@@ -67,6 +67,24 @@ def _address(tensor: Tensor | None) -> int:
     return tensor.data_ptr()
 
 
+class HostCopy:
+    """A copy of a tensor to the host, made at this point of the device's queue; the host does not wait."""
+
+    def __init__(self, values: Tensor) -> None:
+        self._on_host = torch.empty(values.shape, dtype=values.dtype, pin_memory=values.is_cuda)
+        self._on_host.copy_(values, non_blocking=values.is_cuda)
+        self._copied: torch.cuda.Event | None = None
+        if values.is_cuda:
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            self._copied.record(torch.cuda.current_stream(values.device))
+
+    def read(self) -> NDArray[Any]:
+        """Return the values. Waits until the copy has finished."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return np.asarray(self._on_host.numpy())
+
+
 class Device:
     """The kernels on one CUDA device; each program is compiled at its first use."""
 

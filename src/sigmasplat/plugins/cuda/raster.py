@@ -3,8 +3,8 @@
 The number of (tile, splat) pairs is known only on the device. After the first image, memory for the expected number is
 allocated, so the host does not wait during a forward pass. If an image has more pairs than expected, `blend` processes
 all splats instead of lists: the result is the same, but slower. The backward pass then knows the number and lists the
-pairs again. Loops that must run without the host use the methods that end in `_within`. They never allocate more
-memory; `pairs` says on the device whether all pairs fitted.
+pairs again. Loops that must run without the host use `within`, which never allocates more memory; `pairs` says on the
+device whether all pairs fitted.
 """
 
 import math
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sigmasplat.api import BackendError, Camera, RenderConfig
 from sigmasplat.plugins.cuda.cubins import FEATURE_COUNTS, FITTING
-from sigmasplat.plugins.cuda.launch import Argument, Launcher, Struct, blocks_for
+from sigmasplat.plugins.cuda.launch import Argument, HostCopy, Launcher, Struct, blocks_for
 
 TILE = 16
 GEOMETRY = 8
@@ -53,7 +53,6 @@ class Raster:
     def __init__(self, launch: Launcher, device: torch.device, capacity: int | None = None) -> None:
         """capacity: initial number of pairs to allocate memory for; by default the host waits for the first image."""
         self._launch, self.device, self.capacity = launch, device, capacity
-        self._arrived: torch.cuda.Event | None = None
         self.n = 0
 
     def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig) -> None:
@@ -86,42 +85,26 @@ class Raster:
         """Run a kernel with a thread for each splat."""
         self.launch(kernel, blocks_for(self.n), *arguments)
 
-    def bin(self) -> None:
-        """For each tile, list the packed splats that reach it, near to far."""
-        self._order_splats()
-        self._send_total()
-        if self.capacity is None:
-            self.make_room()
-        else:
-            self._list()
-
-    def bin_within(self) -> None:
-        """List the pairs that fit into the allocated memory, without informing the host of their number."""
-        self._order_splats()
-        self._list()
-
-    def _order_splats(self) -> None:
+    def bin(self, within: bool = False) -> None:
+        """For each tile, list the packed splats that reach it, near to far; `within`: the pairs that fit into the
+        allocated memory, without informing the host of their number."""
         self._order = torch.sort(self.depths, stable=True).indices
         self._ends = self.counts[self._order].cumsum(0)
         self._total = self._ends[-1:] if self.n else torch.zeros(1, dtype=torch.int64, device=self.device)
 
-    def _send_total(self) -> None:
-        """Start copying the number of pairs to the host, without waiting for it."""
-        on_cuda = self.device.type == "cuda"
-        self._host_total = torch.empty(1, dtype=torch.int64, pin_memory=on_cuda)
-        self._host_total.copy_(self._total, non_blocking=on_cuda)
-        if on_cuda:
-            self._arrived = torch.cuda.Event()  # type: ignore[no-untyped-call]
-            self._arrived.record(torch.cuda.current_stream(self.device))
+        if not within:
+            self._host_total = HostCopy(self._total)
+        if self.capacity is None and not within:
+            self.make_room()
+        else:
+            self._list()
 
     def make_room(self) -> None:
         """List the pairs again if they did not all fit. Waits only for their number, which is known before the image.
 
         Raises BackendError as `expect` does.
         """
-        if self._arrived is not None:
-            self._arrived.synchronize()
-        total = int(self._host_total)
+        total = int(self._host_total.read()[0])
         if self.capacity is None or total > self.capacity:
             self.expect(total)
             self._list()
@@ -186,25 +169,20 @@ class Raster:
         )  # fmt: skip
         return self._summed(records), moment
 
-    def pose_gradients(self, planes: Planes, on_sums: Tensor) -> Tensor:
-        """Sum the gradients of colour and depth only, which are the first four planes."""
-        self.make_room()
-        return self._summed(self._pose_records(planes, on_sums))
-
-    def pose_gradients_within(self, planes: Planes, on_sums: Tensor) -> Tensor:
-        """Sum the gradients of colour and depth in the memory that there is; if not all pairs fit, all sums are 0."""
-        records = self._pose_records(planes, on_sums)
-        self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
-        return self._summed(records)
-
-    def _pose_records(self, planes: Planes, on_sums: Tensor) -> Tensor:
+    def pose_gradients(self, planes: Planes, on_sums: Tensor, within: bool) -> Tensor:
+        """Sum the gradients of colour and depth only, which are the first four planes; `within`: in the memory that
+        there is, and if not all pairs fit, all sums are 0."""
+        if not within:
+            self.make_room()
         records = self.empty(self._room, _rounded(MOMENTS + 4))
         outputs = Planes(planes.sums, None, planes.alpha)
         self.launch(
             "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots,
             self.used, outputs, (on_sums, None, None), records,
         )  # fmt: skip
-        return records
+        if within:
+            self.launch_fit("drop_pairs", blocks_for(self.n), self.pairs, self.n, self.counts)
+        return self._summed(records)
 
     def _summed(self, records: Tensor) -> Tensor:
         floats = records.shape[1]

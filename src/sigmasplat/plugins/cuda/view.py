@@ -41,16 +41,19 @@ class CudaView:
     def forward(
         self, params: Tensor, T_camera_world: Matrix, depth_reference: Tensor | None = None, layers: bool = False
     ) -> None:
-        params = self._on_device(params)
-        r, n = self.raster, len(params)
         self._params = view_params(self.camera, T_camera_world, self.options)
         if depth_reference is not None:
             self._reference.copy_(depth_reference)
         self._made = (depth_reference is not None, layers)
+        self._render(params, None)
+
+    def _render(self, params: Tensor, pose: Tensor | None) -> None:
+        """Render at `_params`, or at a pose that is on the device; the host does not wait then."""
+        r, n, params = self.raster, len(params), self._on_device(params)
         r.prepare(n, len(self.sums), self.camera, self.options)
-        r.each_splat("pack_view", self._params, None, params, n, r.frame, r.packed)
-        r.bin()
-        r.blend(self._planes, self._reference if depth_reference is not None else None)
+        r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
+        r.bin(within=pose is not None)
+        r.blend(self._planes, self._reference if self._made[0] else None)
 
     def _on_device(self, params: Tensor) -> Tensor:
         """Return rows on this device, contiguous, as the kernels need them."""
@@ -86,32 +89,22 @@ class CudaView:
         return found[:-1]
 
     def backward_pose(self, params: Tensor) -> Matrix:
-        r = self.raster
-        sums = r.pose_gradients(self._planes, self.g_sums)
-        twists = r.twists()
-        r.each_splat(
-            "chain_pose", self._params, None, self._on_device(params), r.counts, sums, r.n, sums.shape[1], twists
-        )
-        return twists.sum(0).cpu().numpy()
+        return self.follow_back(params, None).sum(0).cpu().numpy()
 
     def follow(self, params: Tensor, pose: Tensor) -> None:
         """Render rows [N, 17] to `sums` and `alpha`; T_camera_world, float32 [4, 4], is on the device. The host does
         not wait."""
-        params = self._on_device(params)
-        r, n, self._made = self.raster, len(params), (False, False)
-        r.prepare(n, len(self.sums), self.camera, self.options)
-        r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
-        r.bin_within()
-        r.blend(self._planes, None)
+        self._made = (False, False)
+        self._render(params, pose)
 
-    def follow_back(self, params: Tensor, pose: Tensor) -> Tensor:
+    def follow_back(self, params: Tensor, pose: Tensor | None) -> Tensor:
         """Propagate the gradient planes of colour and depth to that pose. Return twists [blocks, 6] on the device, to
         be summed.
 
-        They are 0 if there were more `raster.pairs` than fit into memory.
+        They are 0 if there were more `raster.pairs` than fit into memory. None: the pose of `forward`, with all pairs.
         """
         r = self.raster
-        sums = r.pose_gradients_within(self._planes, self.g_sums)
+        sums = r.pose_gradients(self._planes, self.g_sums, within=pose is not None)
         twists, rows = r.twists(), self._on_device(params)
         r.each_splat("chain_pose", self._params, pose, rows, r.counts, sums, r.n, sums.shape[1], twists)
         return twists
