@@ -264,7 +264,7 @@ from sigmasplat.run.session import Session as Session, new_folder as new_folder
 from sigmasplat.run.terminal import Screen as Screen
 from sigmasplat.run_folder import splat_ply as splat_ply
 from sigmasplat.run_folder.frames import RunFrames as RunFrames, noted_up as noted_up
-from sigmasplat.run_folder.run_values import MOST_NUMBER as MOST_NUMBER, frame_seconds as frame_seconds
+from sigmasplat.run_folder.run_values import MOST_NUMBER as MOST_NUMBER, fits as fits, frame_seconds as frame_seconds
 from sigmasplat.run_folder.runs import MESH as MESH, TRUTH as TRUTH, RunFolder as RunFolder
 from sigmasplat.run_folder.splat_values import (
     SH_C0 as SH_C0,

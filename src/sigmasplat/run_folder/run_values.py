@@ -1,9 +1,10 @@
 """Check the JSON files of a run when they are read: a damaged file is named, with what is wrong."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin
 
 from sigmasplat.data.trajectory import APART, LOST, RELOCALISED, TRACKED
 from sigmasplat.errors import RunError
@@ -16,40 +17,42 @@ Kind = Any
 
 
 def fits(value: Any, kind: Kind) -> bool:
-    """Return whether a value from JSON is of a kind: None, a class, [kind of the items], {"": kind of the values}, a
-    tuple of kinds, or a test. Numbers have a usable size, and are not bool."""
-    if isinstance(kind, tuple):
-        return any(fits(value, one) for one in kind)
-    if isinstance(kind, list):
-        return isinstance(value, list) and all(fits(item, kind[0]) for item in value)
-    if isinstance(kind, dict):
-        return isinstance(value, dict) and all(fits(item, kind[""]) for item in value.values())
+    """Return whether a value from JSON or TOML is of a kind: a type, such as list[float] or str | None, or a
+    test. Numbers have a usable size, and are not bool."""
+    of: Any = get_origin(kind)
+    parts = get_args(kind)
+    if of is UnionType:
+        return any(fits(value, one) for one in parts)
+    if of in (list, Sequence):
+        return isinstance(value, list | tuple) and all(fits(item, parts[0]) for item in value)
+    if of in (dict, Mapping):
+        return isinstance(value, dict) and all(fits(item, parts[1]) for item in value.values())
     if kind is int or kind is float:
         number = isinstance(value, int | kind) and not isinstance(value, bool)
         return number and abs(value) <= MOST_NUMBER
     if isinstance(kind, type):
         return isinstance(value, kind)
-    return value is None if kind is None else bool(kind(value))
+    return bool(kind(value))
 
 
 def _vector(value: Any) -> bool:
-    return fits(value, [float]) and len(value) == 3
+    return fits(value, list[float]) and len(value) == 3
 
 
 LOG: Mapping[str, Kind] = {
     "index": lambda value: fits(value, int) and value >= 0, "timestamp_s": float, "is_keyframe": bool, "lost": bool,
-    "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": int, "p_off": (float, None),
-    "splats": int, "submap": int, "tracking": {"": (float, None, bool)}, "seconds": {"": float},
-    "T_world_camera": lambda value: fits(value, [[float]]) and list(map(len, value)) == [4] * 4,
-    "loops": [dict], "diagnosis": str, "specific_force_m_s2": _vector,
+    "state": lambda value: value in (TRACKED, RELOCALISED, LOST, APART), "component": int, "p_off": float | None,
+    "splats": int, "submap": int, "tracking": dict[str, float | bool | None], "seconds": dict[str, float],
+    "T_world_camera": lambda value: fits(value, list[list[float]]) and list(map(len, value)) == [4] * 4,
+    "loops": list[dict[str, object]], "diagnosis": str, "specific_force_m_s2": _vector,
 }  # fmt: skip
 """Values of a line of log.jsonl."""
 FACTS: Mapping[str, Kind] = {
-    "source": str, "source_path": str, "status": str, "skipped": [str], "wall_s": (float, None),
-    "finish_s": (float, None), "final_steps": (float, None), "machine": dict, "onto": dict, "camera": dict,
-    "source_frames": int, "depth_units_per_metre": (float, None), "isa": (str, None), "scene_scale": (float, None),
-    "depth_noise_per_m": (float, None), "sensor": (str, None), "predicted_depth": bool, "checkpoint": str,
-    "sensor_times": {"": (float, [float])},
+    "source": str, "source_path": str, "status": str, "skipped": list[str], "wall_s": float | None,
+    "finish_s": float | None, "final_steps": float | None, "machine": dict, "onto": dict, "camera": dict,
+    "source_frames": int, "depth_units_per_metre": float | None, "isa": str | None, "scene_scale": float | None,
+    "depth_noise_per_m": float | None, "sensor": str | None, "predicted_depth": bool, "checkpoint": str,
+    "sensor_times": dict[str, float | list[float]],
     "up_world": lambda value: _vector(value) and math.hypot(*value) > 0.0,
 }  # fmt: skip
 """Values of run.json that commands use."""

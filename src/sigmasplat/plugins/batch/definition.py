@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from sigmasplat.api import (
     MOST_NUMBER,
     Config,
     ConfigError,
+    fits,
     guarded,
     list_presets,
     nearest,
@@ -16,6 +17,7 @@ from sigmasplat.api import (
     presets_by_scene,
 )
 from sigmasplat.plugins.batch.job import Job
+from sigmasplat.plugins.presets.shared_by_papers import read_values
 from sigmasplat.plugins.presets.table_files import read_table
 
 MEAN = "mean"
@@ -103,9 +105,13 @@ class Table:
     @staticmethod
     def read(name: str) -> "Table":
         """Read a definition. Raises ConfigError if it is unknown or not valid."""
-        values = read_table(name)
+        values, shared = read_table(name), read_values("values/tables")
         parts = {"scenes": Scene, "systems": System, "scores": Score, "published": Published}
         with guarded(f"table {name}", "docs/tables.md shows a definition", ConfigError, "not valid"):
+            values = (shared["data"][values.pop("data")] if "data" in values else {}) | values
+            named = [{"name": s} | shared["scores"][s] if isinstance(s, str) else s for s in values.get("scores", [])]
+            source = {"source": values.pop("source")} if "source" in values else {}
+            values |= {"scores": named, "published": [source | row for row in values.get("published", [])]}
             built: dict[str, Any] = {
                 key: tuple(_typed(kind(**row)) for row in values.pop(key, [])) for key, kind in parts.items()
             }
@@ -178,19 +184,6 @@ def _typed(part: Any) -> Any:
     """Return a part of a definition. Raises TypeError if a value is not of the type of its field."""
     hints = get_type_hints(type(part))
     for each in fields(part):
-        if not _fits(value := getattr(part, each.name), hints[each.name]):
+        if not fits(value := getattr(part, each.name), hints[each.name]):
             raise TypeError(f"{each.name} of a {type(part).__name__.lower()} cannot be {value!r:.60}")
     return part
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value from TOML has a type; numbers of a size that formats and products can take."""
-    parts = get_args(hint)
-    if get_origin(hint) is Mapping:
-        return isinstance(value, dict) and all(_fits(item, parts[1]) for item in value.values())
-    if get_origin(hint) is Sequence:
-        return isinstance(value, list | tuple) and all(_fits(item, parts[0]) for item in value)
-    if hint is float or hint is int:
-        allowed = int | float if hint is float else int
-        return isinstance(value, allowed) and not isinstance(value, bool) and 0 <= abs(value) <= MOST_NUMBER
-    return isinstance(value, hint)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -61,17 +62,11 @@ class Job:
     def started_in(self, folder: Path) -> bool:
         """Return whether a folder has a run of this job, with the same settings, code and scores."""
         facts = _facts(folder)
-        if not facts:
-            return False
-        noted = facts.get(FACT)
-        try:
-            settings = read_json(folder / "config.json")
-        except SigmaSplatError:
-            return False
-        if not isinstance(noted, dict):
-            return False
-        used = config_of_facts(facts, self.config, self.given)
-        return self.facts().items() <= noted.items() and bool(settings == json.loads(json.dumps(used.to_dict())))
+        noted, used = facts.get(FACT), config_of_facts(facts, self.config, self.given)
+        with suppress(SigmaSplatError):
+            if isinstance(noted, dict) and self.facts().items() <= noted.items():
+                return bool(read_json(folder / "config.json") == json.loads(json.dumps(used.to_dict())))
+        return False
 
     def finished_in(self, folder: Path) -> bool:
         """Return whether a folder has the complete, scored run of this job."""
