@@ -77,9 +77,8 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     agreement = _agreement(source, frames)
     times_s = times_of(source)
     warnings = [
-        *guessed, *filter(None, [unlikely_camera(source.camera)]), *time_warnings(times_s), *_unused_warnings(source),
-        *_depth_warnings(source, frames, settings), *_registration_warnings(source, agreement),
-        *_brightness_warnings(frames), *motion_warnings(motion, first),
+        *guessed, *filter(None, [unlikely_camera(source.camera)]), *time_warnings(times_s),
+        *_warnings(source, frames, settings, agreement), *motion_warnings(motion, first),
     ]  # fmt: skip
     rows = [
         ("format", name), *_size_rows(source, times_s), *_depth_rows(source, frames, settings),
@@ -150,13 +149,6 @@ def _readings(frames: list[Frame]) -> NDArray[np.float32]:
     return np.concatenate([frame.depth_m[frame.depth_m > 0] for frame in frames])
 
 
-def _unused_warnings(source: Source) -> list[str]:
-    unused = len(source.skipped)
-    if unused <= MANY_UNUSED * (len(source) + unused):
-        return []
-    return [f"{unused} of {len(source) + unused} images are not used (first: {source.skipped[0]})"]
-
-
 def _size_rows(source: Source, times_s: NDArray[np.float64]) -> list[tuple[str, str]]:
     count, camera = len(source), source.camera
     span_s = float(np.ptp(times_s)) if len(times_s) else 0.0
@@ -170,6 +162,11 @@ def _size_rows(source: Source, times_s: NDArray[np.float64]) -> list[tuple[str, 
 
 def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> list[tuple[str, str]]:
     unit = f"{source.depth_units_per_metre:g} per metre" if source.depth_units_per_metre else "metres"
+    camera = "same as colour, according to the recording"
+    if source.depth_registered:
+        camera = "separate; SigmaSplat registers depth to colour"
+    elif source.registrable and settings.register_depth == "off":
+        camera = "separate; depth is not registered (--register-depth off)"
     readings = _readings(frames)
     if not len(readings):
         return [("depth", "no depth reading in the sampled frames")]
@@ -180,7 +177,7 @@ def _depth_rows(source: Source, frames: list[Frame], settings: InputConfig) -> l
         ("depth unit", "arbitrary: a network predicted depth" if source.predicted_depth else unit),
         ("depth", f"{low:.2f} to {high:.2f} m, median {middle:.2f} m; {used:.0%} within the limits of the run"),
         ("without depth", f"{_holes(frames):.0%} of the pixels"),
-        ("depth camera", _depth_camera(source, settings)),
+        ("depth camera", camera),
     ] + [("your depth scale", f"it gives a median depth of {middle:.2f} m: is this plausible?")] * bool(
         settings.depth_scale
     )
@@ -195,30 +192,33 @@ def _imu_rows(frames: list[Frame]) -> list[tuple[str, str]]:
     return [(name, f"measured {n} of {len(frames)} sampled frames") for name, n in measured.items() if n]
 
 
-def _depth_camera(source: Source, settings: InputConfig) -> str:
-    if source.depth_registered:
-        return "separate; SigmaSplat registers depth to colour"
-    if source.registrable and settings.register_depth == "off":
-        return "separate; depth is not registered (--register-depth off)"
-    return "same as colour, according to the recording"
-
-
 def _holes(frames: list[Frame]) -> float:
     return float(np.mean([(frame.depth_m == 0).mean() for frame in frames]))
 
 
-def _depth_warnings(source: Source, frames: list[Frame], settings: InputConfig) -> list[str]:
-    warnings = [*filter(None, [depth_warning(source, read=frames)]), *source.depth_doubts]
+def _warnings(
+    source: Source, frames: list[Frame], settings: InputConfig, agreement: EdgeAgreement | None
+) -> Iterator[str]:
+    unused, every = len(source.skipped), len(source) + len(source.skipped)
+    if unused > MANY_UNUSED * every:
+        yield f"{unused} of {every} images are not used (first: {source.skipped[0]})"
+    yield from (*filter(None, [depth_warning(source, read=frames)]), *source.depth_doubts)
     if _holes(frames) > MANY_HOLES:
-        warnings.append(f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes")
+        yield f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes"
     max_depth_m = settings.max_depth_m * source.scene_scale
     beyond = np.mean([(frame.depth_m > max_depth_m).mean() for frame in frames])
     if beyond > 0.2:
-        warnings.append(
+        yield (
             f"{beyond:.0%} of the pixels are beyond {max_depth_m:g} m and are not used; "
             "to use them: --set input.max_depth_m=METRES"
         )
-    return warnings
+    yield from _registration_warnings(source, agreement)
+    brightness = np.array([frame.color.mean() for frame in frames])
+    mean = max(float(brightness.mean()), 1e-6)
+    steps = np.abs(np.diff(brightness)) / mean
+    if len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
+        change = float(np.ptp(brightness) / mean)
+        yield f"brightness changes by {change:.0%}; if exposure is automatic: --set tracking.exposure=true"
 
 
 def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> list[str]:
@@ -230,15 +230,6 @@ def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> l
         else "give depth_camera and T_color_depth in calibration.json, or correct them"
     )
     return [f"depth is not registered to colour ({agreement.sentence()}); {remedy}"]
-
-
-def _brightness_warnings(frames: list[Frame]) -> list[str]:
-    brightness = np.array([frame.color.mean() for frame in frames])
-    change = float(np.ptp(brightness) / max(float(brightness.mean()), 1e-6))
-    steps = np.abs(np.diff(brightness)) / max(float(brightness.mean()), 1e-6)
-    if len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
-        return [f"brightness changes by {change:.0%}; if exposure is automatic: --set tracking.exposure=true"]
-    return []
 
 
 def _suggested(format_name: str) -> str:

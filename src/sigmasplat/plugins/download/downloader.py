@@ -178,19 +178,11 @@ def unpack(archive: Path, folder: Path, most_bytes: int, progress: "Progress") -
     Raises ArchiveError if the archive is damaged, holds links or names outside the folder, or more than `most_bytes`;
     DownloadError if the disk is full. Files written before the error remain, so use a temporary folder.
     """
-    with _naming_archive(archive):
-        folder.mkdir(parents=True, exist_ok=True)
-        if archive.name.lower().endswith(".zip"):
-            _unpack_zip(archive, folder, most_bytes, progress)
-        else:
-            _unpack_tar(archive, folder, most_bytes, progress)
-    progress(archive.stat().st_size, archive.stat().st_size)
-
-
-@contextmanager
-def _naming_archive(archive: Path) -> Iterator[None]:
     try:
-        yield
+        folder.mkdir(parents=True, exist_ok=True)
+        unpacked = _unpack_zip if archive.name.lower().endswith(".zip") else _unpack_tar
+        unpacked(archive, folder, most_bytes, progress)
+        progress(archive.stat().st_size, archive.stat().st_size)
     except ArchiveError as problem:
         raise ArchiveError(f"{archive.name} {problem}; it is refused, and no file of it is kept") from problem
     except (*DAMAGE, zlib.error, EOFError, NotImplementedError, RuntimeError) as problem:

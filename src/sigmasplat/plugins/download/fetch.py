@@ -9,7 +9,7 @@ import os
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -81,7 +81,7 @@ def _continue(url: str, file: IO[bytes], progress: "Progress", check_size: Check
             raise _Broken(f"{host} sent another part of the file than requested")
         total = file.tell() + int(length) if length.isdigit() else None
         check_size(total, file.tell())
-        for chunk in _chunks(response):
+        while chunk := _received(response):
             file.write(chunk)
             progress(file.tell(), total or 0)
     if total is not None and file.tell() != total:
@@ -118,10 +118,9 @@ def _requested(url: str, file: IO[bytes]) -> http.client.HTTPResponse:
     return response
 
 
-def _chunks(response: http.client.HTTPResponse) -> Iterator[bytes]:
-    """Yield the body as it arrives. Raises _Broken if the connection fails."""
+def _received(response: http.client.HTTPResponse) -> bytes:
+    """Return what has arrived of the body, b"" at its end. Raises _Broken if the connection fails."""
     try:
-        while chunk := response.read1(CHUNK_BYTES):
-            yield chunk
+        return response.read1(CHUNK_BYTES)
     except (OSError, http.client.HTTPException) as problem:
         raise _Broken(f"the connection to {urlsplit(response.geturl()).hostname} broke ({problem!r})") from problem
