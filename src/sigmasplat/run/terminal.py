@@ -88,7 +88,7 @@ class Screen:
     @contextmanager
     def _counters(self, of_bytes: bool = False) -> Iterator[Begin]:
         if not self.out.is_terminal:
-            yield partial(_PlainShow, self.say, decimal if of_bytes else str)
+            yield partial(_plain, self.say, decimal if of_bytes else str)
             return
         count = progress.DownloadColumn() if of_bytes else progress.MofNCompleteColumn()
         columns = "{task.description}", progress.BarColumn(), count, progress.TextColumn("{task.fields[text]}")
@@ -190,20 +190,17 @@ class _StepShow(Callback):
         self.component = component
 
 
-class _PlainShow:
-    def __init__(
-        self, say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None
-    ) -> None:
-        self.say, self.written, self.title, self.total = say, written, title, total
-        self.last_s, self.last_line = time.perf_counter(), ""
+def _plain(say: Callable[[str], None], written: Callable[[int], str], title: str, total: int | None) -> Show:
+    last_s, last_line = time.perf_counter(), ""
 
-    def __call__(self, done: int, known: int | None, text: str) -> None:
-        total = known or self.total
-        now_s = time.perf_counter()
-        if done in (0, total) or now_s - self.last_s >= PLAIN_LINES_EVERY_S:
-            whole = "?" if total is None else self.written(total)
-            line = f"{self.title} {self.written(done)}/{whole}  {text}".rstrip()
-            line = f"{self.title} …" if done == 0 and total is None else line
-            if line != self.last_line:
-                self.say(line)
-            self.last_s, self.last_line = now_s, line
+    def show(done: int, known: int | None, text: str) -> None:
+        nonlocal last_s, last_line
+        whole, now_s = known or total, time.perf_counter()
+        if done in (0, whole) or now_s - last_s >= PLAIN_LINES_EVERY_S:
+            line = f"{title} {written(done)}/{'?' if whole is None else written(whole)}  {text}".rstrip()
+            line = f"{title} …" if done == 0 and whole is None else line
+            if line != last_line:
+                say(line)
+            last_s, last_line = now_s, line
+
+    return show

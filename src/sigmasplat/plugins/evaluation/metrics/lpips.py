@@ -67,21 +67,17 @@ class Lpips:
                 raise ConfigError(f"{path}: holds NaN or inf; download the file again")
         return Lpips(features.float(), tuple(weight.float().flatten() for weight in heads.parameters()))
 
+    @torch.inference_mode()
     def distance(self, rendered: Pixels, recorded: Pixels) -> float:
-        """Return the distance of two images [H, W, 3] in [0, 1], 0 if they are equal: the sum over the layers.
+        """Return the distance of two images [H, W, 3] in [0, 1], 0 if they are equal: the sum over the layers of the
+        mean over pixels of the weighted squared difference of unit features (Zhang et al. 2018, eq. 1).
 
         nan if a side is shorter than `LEAST_PX`.
         """
-        return float(self.layer_distances(rendered, recorded).sum())
-
-    @torch.inference_mode()
-    def layer_distances(self, rendered: Pixels, recorded: Pixels) -> NDArray[np.float64]:
-        """Return the distance of each layer [5] (Zhang et al. 2018, eq. 1): the mean over pixels of the weighted
-        squared difference of unit features."""
         if min(rendered.shape[:2]) < LEAST_PX:
-            return np.full(len(self.linear), np.nan)
+            return float("nan")
         pairs = zip(self._unit_features(rendered), self._unit_features(recorded), self.linear, strict=True)
-        return np.array([float(((a - b) ** 2 * weight[:, None, None]).sum(0).mean()) for a, b, weight in pairs])
+        return sum(float(((a - b) ** 2 * weight[:, None, None]).sum(0).mean()) for a, b, weight in pairs)
 
     def _unit_features(self, image: Pixels) -> list[Tensor]:
         """Return the features [C, H', W'] of the layers, of unit norm at every pixel."""

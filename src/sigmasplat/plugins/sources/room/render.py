@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy import ndimage
 
 from sigmasplat.api import Camera, Matrix, se3
 from sigmasplat.plugins.sources.room.capture import Image
@@ -48,7 +48,7 @@ class Light:
         """Return the light on surface points, RGB [3, N], and the visible shares of lamp and window [2, N]."""
         start = np.array([[self.room_x_m - HALF_X_M - WALL_M], [-HALF_Y_M], [0.0]], np.float32)
         where = (points + np.float32(0.6 * CELL_M) * normals - start) / np.float32(CELL_M) - 0.5
-        ambient, lamp, window = (map_coordinates(s, where, order=1, mode="nearest") for s in self.shares)
+        ambient, lamp, window = (ndimage.map_coordinates(s, where, order=1, mode="nearest") for s in self.shares)
         total = AMBIENT_COLOR * (0.35 + 0.65 * ambient)
         total = total + LAMP_COLOR * (lamp * _lamp_light(self.place(LAMP_M) - points, normals, 1.6))
         total = total + WINDOW_COLOR * (window * _lamp_light(self.place(WINDOW_M) - points, normals, 1.4))
@@ -126,7 +126,7 @@ def _filled(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_
     """Give points inside solids the light of the nearest free point, so that surfaces are not too dark."""
     if solid.all() or not solid.any():
         return shares
-    nearest = distance_transform_edt(solid, return_distances=False, return_indices=True)
+    nearest = ndimage.distance_transform_edt(solid, return_distances=False, return_indices=True)
     return np.asarray(shares[tuple(nearest)])
 
 
@@ -190,13 +190,10 @@ def _rays(camera: Camera, T_world_camera: NDArray[np.float64], pixels: Floats) -
 
 
 def _edges(faces: Indices) -> NDArray[np.bool_]:
-    marked = np.zeros(faces.shape, bool)
-    across, down = faces[:, 1:] != faces[:, :-1], faces[1:] != faces[:-1]
-    marked[:, 1:] |= across
-    marked[:, :-1] |= across
-    marked[1:] |= down
-    marked[:-1] |= down
-    return marked
+    around = ndimage.generate_binary_structure(2, 1)
+    return np.asarray(
+        ndimage.maximum_filter(faces, footprint=around) != ndimage.minimum_filter(faces, footprint=around)
+    )
 
 
 @dataclass(frozen=True, eq=False)
