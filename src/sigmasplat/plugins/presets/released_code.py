@@ -35,6 +35,7 @@ def _varsplat(row: dict[str, Any]) -> Config:
 
 def _cgslam(row: dict[str, Any]) -> Config:
     """Return the settings of a scene of CG-SLAM's code."""
+    row = CODE["cgslam-usual"] | row
     config = cgslam.DATASETS[row["like"]].changed(**CODE["cgslam"]).changed(
         mapping={
             "every": row["every"], "iterations": row["map_iterations"], "window": row["window"],
