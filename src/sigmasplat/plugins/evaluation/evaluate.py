@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sigmasplat.api import (
     TRUTH,
@@ -138,26 +139,17 @@ def _score_path(
     return None if problem else truth, scale, scores, problem
 
 
-def _anchors(run: RunFolder, records: Log, final: FinalConfig) -> NDArray[np.float64] | None:
-    """Return T_world_submap [S, 4, 4] if the run kept the submaps of all its frames, else None.
-
-    Returns None too if there is one submap and the final map is an unchanged copy of it.
-    """
-    count = _submaps(records)
-    if len(run.submaps) != count or (count == 1 and final.seed_from == "submaps" and not final.iterations):
-        return None
-    anchors = run.read_checkpoint()[0].get("T_world_submap")
-    return None if anchors is None or len(anchors) != count else np.asarray(anchors, np.float64)
-
-
 def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: FinalConfig) -> view_scores.MapSources:
-    """Return the final map and the submaps, with the poses of the frames in them and the exposures of the frames, if
-    the checkpoint has these."""
-    anchors = _anchors(run, records, final)
-    saved = run.read_checkpoint()[0] if (run.path / "checkpoint.safetensors").is_file() else {}
-    poses, exposures = (
-        np.asarray(saved[name], np.float64) if len(saved.get(name, ())) == len(records) else None
-        for name in ("T_submap_camera", "exposure")
+    """Return the final map; the submaps, if the run kept those of all its frames and the final map is not an unchanged
+    copy of the only one; the poses of the frames in them, and exposures, if the checkpoint has these."""
+    count, saved = _submaps(records), dict[str, Tensor]()
+    kept = len(run.submaps) == count and (count > 1 or final.seed_from != "submaps" or final.iterations > 0)
+    if kept or (run.path / "checkpoint.safetensors").is_file():
+        saved = run.read_checkpoint()[0]
+    sizes = {"T_world_submap": count * kept, "T_submap_camera": len(records), "exposure": len(records)}
+    anchors, poses, exposures = (
+        np.asarray(saved[name], np.float64) if 0 < size == len(saved.get(name, ())) else None
+        for name, size in sizes.items()
     )
     poses = None if anchors is None else poses
     return view_scores.MapSources(field, run.submaps, anchors, T_submap_camera=poses, exposures=exposures)
