@@ -2,16 +2,13 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
-
-import tyro
 
 from sigmasplat.commands.input_options import arg
 
 if TYPE_CHECKING:
-    from sigmasplat.plugins.robots.bag import LiveRobot
+    from sigmasplat.plugins.robots.bag import Images, LiveRobot
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.system.slam import Slam
@@ -21,41 +18,30 @@ Bag = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class RobotOptions:
-    """Options of run and resume: the bag."""
-
-    bag: Bag = None
-    bag_images: Annotated[
-        Literal["none", "keyframes", "all"], arg(None, "which images the bag contains, uncompressed")
-    ] = "keyframes"
+BagImages = Annotated[Literal["none", "keyframes", "all"], arg(None, "which images the bag contains, uncompressed")]
 
 
-DEFAULT_ROBOT_OPTIONS = RobotOptions()
-RobotOptionsFlat = Annotated[RobotOptions, tyro.conf.arg(name=""), tyro.conf.OmitArgPrefixes]
-
-
-def check_robot_output(asked: RobotOptions) -> None:
+def check_robot_output(bag: Path | None) -> None:
     """Raise RunError before anything else starts if the bag exists or its folder cannot be written, SourceError if the
     package is missing."""
-    if asked.bag is not None:
+    if bag is not None:
         from sigmasplat.plugins.robots.bag import BagSink
 
-        BagSink(asked.bag)
+        BagSink(bag)
 
 
 @contextmanager
 def robot_output(
-    screen: "Screen", slam: "Slam", folder: "RunFolder", asked: RobotOptions
+    screen: "Screen", slam: "Slam", folder: "RunFolder", bag: Path | None, images: "Images"
 ) -> Iterator["LiveRobot | None"]:
     """Yield the callback that feeds the bag, None if it is not requested; at the end complete it and note in run.json
     how many messages were written."""
-    if asked.bag is None:
+    if bag is None:
         yield None
         return
     from sigmasplat.plugins.robots.bag import LiveRobot
 
-    robot = LiveRobot(slam, asked.bag, screen.warn, asked.bag_images)
+    robot = LiveRobot(slam, bag, screen.warn, images)
     try:
         yield robot
     finally:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat import env
+from sigmasplat.commands.bag_options import Bag, BagImages
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole, arg, flag
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.find_preset import FAMILIES, preset as preset_of
@@ -74,13 +75,15 @@ RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a ma
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of run and resume: scoring, saving, viewer."""
+    """Options of run and resume: scoring, saving, viewer, bag."""
 
     evaluate: Annotated[bool, flag("do not score the run: no metrics, no report", name="eval")] = True
     save_every: SaveEvery = 60.0
     view: View = False
     host: Host = HOST
     port: Port = PORT
+    bag: Bag = None
+    bag_images: BagImages = "keyframes"
 
 
 DEFAULT_RUN_OPTIONS = RunOptions()

@@ -55,8 +55,7 @@ def run(
     out: options.OutFolder = None, overwrite: options.Overwrite = False,
     input_options: InputOptionsFlat = DEFAULT_INPUT_OPTIONS, seed: options.Seed = None,
     record: options.Record = None, run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
-    onto: options.OntoRun = None, final_seconds: options.FinalSeconds = None,
-    robot_options: bag_options.RobotOptionsFlat = bag_options.DEFAULT_ROBOT_OPTIONS, realtime: options.RealTime = False,
+    onto: options.OntoRun = None, final_seconds: options.FinalSeconds = None, realtime: options.RealTime = False,
 ) -> int:  # fmt: skip
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
@@ -71,7 +70,7 @@ def run(
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.system.slam import Slam
 
-    bag_options.check_robot_output(robot_options)
+    bag_options.check_robot_output(run_options.bag)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
@@ -89,13 +88,12 @@ def run(
         )
         _look(screen, source)
         at_once = realtime or (source.live and config.realtime.live)
-        return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, robot_options, at_once)
+        return _run_and_score(screen, StartPoint(slam), source, folder, run_options, viewer, at_once)
 
 
 def resume(
     run: options.RunPath, moved_to: options.MovedSource = None,
     run_options: options.RunOptionsFlat = options.DEFAULT_RUN_OPTIONS,
-    robot_options: bag_options.RobotOptionsFlat = bag_options.DEFAULT_ROBOT_OPTIONS,
 ) -> int:  # fmt: skip
     """Resume a run that was stopped or killed, from its last saved state.
 
@@ -105,7 +103,7 @@ def resume(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    bag_options.check_robot_output(robot_options)
+    bag_options.check_robot_output(run_options.bag)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -113,7 +111,7 @@ def resume(
         start = resumed(folder, source)
         folder.note(status="running")
         screen.say(f"{source.name}: {resume_line(start.next_index, len(source))} → {folder.path}")
-        return _run_and_score(screen, start, source, folder, run_options, viewer, robot_options)
+        return _run_and_score(screen, start, source, folder, run_options, viewer)
 
 
 def resume_line(next_index: int, frames: int) -> str:
@@ -206,7 +204,7 @@ def _announce(screen: "Screen", preset: str, source: "Source", folder: "RunFolde
 
 def _run_and_score(
     screen: "Screen", start: "StartPoint", source: "Source", folder: "RunFolder", run_options: options.RunOptions,
-    viewer: "ViewerApp | None", robot_options: bag_options.RobotOptions, realtime: bool = False,
+    viewer: "ViewerApp | None", realtime: bool = False,
 ) -> int:  # fmt: skip
     """Run the session, then score it, and keep showing it in the viewer until Ctrl-C; return the exit code.
 
@@ -226,7 +224,7 @@ def _run_and_score(
         folder.note(realtime=True)
     motion = MotionWatch(screen.warn)
     with (
-        bag_options.robot_output(screen, start.slam, folder, robot_options) as robot,
+        bag_options.robot_output(screen, start.slam, folder, run_options.bag, run_options.bag_images) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
     ):
         session = Session(
