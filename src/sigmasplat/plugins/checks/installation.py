@@ -68,7 +68,10 @@ def _remedy(problem: BaseException) -> str:
 
 
 def check_cuda() -> Iterator[Finding]:
-    """Check NVRTC, driver and GPUs, one line each. Missing parts are not faults: a machine without a GPU is healthy."""
+    """Check NVRTC, driver and GPUs, one line each, and run the self-test on each GPU.
+
+    Missing parts are not faults: a machine without a GPU is healthy.
+    """
     import torch
 
     from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
@@ -85,7 +88,14 @@ def check_cuda() -> Iterator[Finding]:
         return
     yield check_driver(cubins.compiler_version())
     for index in range(torch.cuda.device_count()):
-        yield from _device(torch.device("cuda", index))
+        device = torch.device("cuda", index)
+        about = torch.cuda.get_device_properties(device)
+        architecture = cubins.architecture_of((about.major, about.minor))
+        yield Finding(str(device), f"{about.name}, {architecture}, {about.total_memory / 2**30:.0f} GiB")
+        try:
+            yield self_test(device)
+        except BackendError as problem:
+            yield Finding("self-test", str(problem), False)
 
 
 def check_driver(compiler: str) -> Finding:
@@ -98,21 +108,6 @@ def check_driver(compiler: str) -> Finding:
     enough = version // 1000 >= int(compiler.split(".")[0])
     advice = "" if enough else f"; too old for NVRTC {compiler}: update it, or {cubins.INSTALL_OLDER}"
     return Finding("CUDA driver", f"for CUDA {version // 1000}.{version % 1000 // 10}{advice}", enough)
-
-
-def _device(device: Any) -> Iterator[Finding]:
-    """Describe a GPU, and run the self-test on it."""
-    import torch
-
-    from sigmasplat.plugins.cuda import cubins
-
-    about = torch.cuda.get_device_properties(device)
-    architecture = cubins.architecture_of((about.major, about.minor))
-    yield Finding(str(device), f"{about.name}, {architecture}, {about.total_memory / 2**30:.0f} GiB")
-    try:
-        yield self_test(device)
-    except BackendError as problem:
-        yield Finding("self-test", str(problem), False)
 
 
 def self_test(device: Any = "cpu") -> Finding:

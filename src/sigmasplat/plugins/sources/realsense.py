@@ -41,7 +41,10 @@ class RealSense(LiveSource):
     def __init__(self, sdk: Any, pipeline: Any, profile: Any, settings: InputConfig) -> None:
         """Read the calibration. Raises SourceError if the settings need more than the camera provides."""
         color = profile.get_stream(sdk.stream.color).as_video_stream_profile()
-        calibration = _calibration(sdk, profile, color, settings)
+        camera, lens = _optics(sdk, color.get_intrinsics())
+        units = round(1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale()), 3)
+        recorded, size = Calibration(camera, units, lens), (camera.width, camera.height)
+        calibration = resolve_calibration(Path("realsense"), recorded, size, settings, units)
         self._rectified = Rectification("realsense", calibration, replace(settings, register_depth="off"))
         super().__init__("realsense", self._rectified.camera, settings)
         self._units = calibration.depth_units_per_metre
@@ -109,13 +112,6 @@ def open_realsense(text: str, settings: InputConfig) -> RealSense:
     except BaseException:
         pipeline.stop()
         raise
-
-
-def _calibration(sdk: Any, profile: Any, color: Any, settings: InputConfig) -> Calibration:
-    camera, lens = _optics(sdk, color.get_intrinsics())
-    units = round(1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale()), 3)
-    size = (camera.width, camera.height)
-    return resolve_calibration(Path("realsense"), Calibration(camera, units, lens), size, settings, units)
 
 
 def _parsed(text: str) -> dict[str, Any]:

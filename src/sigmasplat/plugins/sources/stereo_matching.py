@@ -5,7 +5,6 @@ Semi-global matching prefers some fractions of a pixel, by up to 0.2 px; `refine
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +139,12 @@ class StereoMatcher:
             cv2.copyMakeBorder(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 0, 0, n, 0, cv2.BORDER_REPLICATE)
             for image in (left, right)
         ]
-        found = self._matcher().compute(*gray)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)
+        matcher = cv2.StereoSGBM_create(
+            minDisparity=0, numDisparities=n, blockSize=BLOCK_PX, P1=SMALL_STEP, P2=LARGE_STEP,
+            disp12MaxDiff=CONSISTENT_PX, preFilterCap=PREFILTER, uniquenessRatio=UNIQUE_PERCENT,
+            speckleWindowSize=SPECKLE_PX, speckleRange=SPECKLE_STEP_PX, mode=cv2.STEREO_SGBM_MODE_SGBM,
+        )  # fmt: skip
+        found = matcher.compute(*gray)[:, n:].astype(np.float32) / np.float32(SUBPIXELS)
         column = np.arange(left.shape[1], dtype=np.float32)
         matched = (found > 0) & (column - found >= BLOCK_PX // 2)
         together = cv2.blur(matched.astype(np.float32), (AROUND_PX, AROUND_PX)) >= LEAST_TOGETHER
@@ -158,14 +162,6 @@ class StereoMatcher:
     def noise_per_m(self) -> float:
         """Return the root mean square error of readings, relative to z²."""
         return TAILS * STD_PX / self._focal_baseline
-
-    def _matcher(self) -> Any:
-        cv2 = opencv()
-        return cv2.StereoSGBM_create(
-            minDisparity=0, numDisparities=self._count, blockSize=BLOCK_PX, P1=SMALL_STEP, P2=LARGE_STEP,
-            disp12MaxDiff=CONSISTENT_PX, preFilterCap=PREFILTER, uniquenessRatio=UNIQUE_PERCENT,
-            speckleWindowSize=SPECKLE_PX, speckleRange=SPECKLE_STEP_PX, mode=cv2.STEREO_SGBM_MODE_SGBM,
-        )  # fmt: skip
 
 
 def scene_scale(depth_of: Callable[[int], Floats], frames: int) -> float:
