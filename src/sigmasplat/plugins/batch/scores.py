@@ -63,21 +63,15 @@ def _seconds(run: RunFolder) -> dict[str, float]:
 
 def rows(table: Table, cells: Sequence[Cell], records: Mapping[str, Mapping[str, Any]]) -> list[Row]:
     """Return the rows: for each score the published numbers of a system, then ours; records by the name of the job."""
-    systems = [system.name for system in table.systems]
-    others = [published for published in table.published if published.system not in systems]
-    made = list[Row]()
+    systems, made = [system.name for system in table.systems], list[Row]()
+    others = [published.system for published in table.published if published.system not in systems]
     for score in table.scores:
-        made += [_published(score, published.system, published.scores[score.name]) for published in others
-                 if score.name in published.scores]  # fmt: skip
-        for system in systems:
-            of_paper = [p.scores[score.name] for p in table.published if p.system == system and score.name in p.scores]
-            made += [_published(score, system, numbers) for numbers in of_paper]
-            made.append(Row(score, system, OURS, _ours(table, score, system, cells, records)))
+        for system in (*dict.fromkeys(others), *systems):
+            numbers = [p.scores[score.name] for p in table.published if p.system == system and score.name in p.scores]
+            made += [Row(score, system, PAPER, {scene: Value(n) for scene, n in of.items()}) for of in numbers]
+            if system in systems:
+                made.append(Row(score, system, OURS, _ours(table, score, system, cells, records)))
     return made
-
-
-def _published(score: Score, system: str, numbers: Mapping[str, float]) -> Row:
-    return Row(score, system, PAPER, {scene: Value(number) for scene, number in numbers.items()})
 
 
 def _ours(

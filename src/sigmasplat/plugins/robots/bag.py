@@ -51,8 +51,13 @@ class BagSink:
         """Write a message; its recording time is its stamp. Raises OSError if the disk is full."""
         self.writer.write(self.connections[message.topic.name], message.stamp_ns, message.data)
         self._bytes += len(message.data)
-        if self._bytes > CHUNK_BYTES:
-            self._complete_chunk()
+        if (
+            self._bytes > CHUNK_BYTES
+        ):  # by itself, the library writes to the disk after 1 MB, which are minutes of poses
+            self._bytes = 0
+            with suppress(AttributeError):  # a later version may have other names
+                self.writer.storage.close_chunk()
+                self.writer.storage.bio.flush()
 
     def close(self) -> None:
         """Write the index and metadata.yaml. Raises OSError if the disk is full."""
@@ -62,16 +67,6 @@ class BagSink:
         """Close the file without an index; `mcap recover` reads what was written."""
         with suppress(Exception):
             self.writer.abort()
-
-    def _complete_chunk(self) -> None:
-        """Write the messages so far to the disk, so that little is lost if the process is killed.
-
-        By itself, the library does this after 1 MB, which are minutes of poses. A later version may have other names.
-        """
-        self._bytes = 0
-        with suppress(AttributeError):
-            self.writer.storage.close_chunk()
-            self.writer.storage.bio.flush()
 
     def _quality(self, topic: Topic) -> Any:
         kinds, no_limit = self.interfaces, self.interfaces.QosTime(2147483647, 4294967295)
@@ -167,7 +162,8 @@ class LiveRobot(Callback):
         try:
             action()
         except Exception as problem:
-            self.failure = _reason(problem)
+            known = isinstance(problem, OSError) and problem.strerror
+            self.failure = known or f"{type(problem).__name__}: {problem}".splitlines()[0]
             self.sink.abort()
             self.warn(f"the bag ended ({self.failure}) after {self.written} messages; the run goes on")
 
@@ -204,9 +200,3 @@ class LiveRobot(Callback):
             links.insert(0, (ros.MAP, ros.ODOM, se3.orthonormalise(T_map_link @ se3.inverse(T_odom_link))))
         odometry = self.messages.odometry(stamp_ns, ros.ODOM, ros.LINK, T_odom_link)
         return [self.messages.transforms(ros.TF, stamp_ns, links), odometry]
-
-
-def _reason(problem: Exception) -> str:
-    if isinstance(problem, OSError) and problem.strerror:
-        return problem.strerror
-    return f"{type(problem).__name__}: {problem}".splitlines()[0]

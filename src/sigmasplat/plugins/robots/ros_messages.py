@@ -75,10 +75,6 @@ def _rotation(T: Matrix) -> dict[str, float]:
     return dict(zip("wxyz", map(float, se3.quaternion_from_rotation(T[:3, :3])), strict=True))
 
 
-def _pose(T: Matrix) -> dict[str, Any]:
-    return {"position": _xyz(T[:3, 3]), "orientation": _rotation(T)}
-
-
 def _header(stamp_ns: int, frame: str) -> dict[str, Any]:
     return {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": frame}
 
@@ -106,9 +102,8 @@ class RosMessages:
         """Make nav_msgs/Odometry: the pose T_parent_child. Its covariance and that of velocities, which are not
         estimated, are marked as not known."""
         unknown = {"covariance": np.array(UNKNOWN)}
-        return self._encoded(
-            ODOMETRY, stamp_ns, parent, child_frame_id=child, pose={"pose": _pose(T), **unknown}, twist=unknown
-        )
+        pose = {"pose": {"position": _xyz(T[:3, 3]), "orientation": _rotation(T)}, **unknown}
+        return self._encoded(ODOMETRY, stamp_ns, parent, child_frame_id=child, pose=pose, twist=unknown)
 
     def images(
         self, stamp_ns: int, camera: Camera, color: NDArray[np.float32], depth_m: NDArray[np.float32]
