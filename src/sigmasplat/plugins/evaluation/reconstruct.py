@@ -26,7 +26,6 @@ from sigmasplat.api import (
     RunError,
     RunFolder,
     Source,
-    SplatStd,
     Trajectory,
     count_keyframes,
     fuse,
@@ -95,20 +94,16 @@ class FusionInput:
     ) -> Mesh:
         """Fuse renders of the map at the keyframes into a mesh in the run's world.
 
-        Its vertices have a standard deviation (`with_std`) if the run has measured it. Calls `progress(done, total)`
-        with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
+        Its vertices have the depth_std_m of the nearest opaque splat, if the run has measured it. Calls
+        `progress(done, total)` with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
         """
         views, total = self.views()
         mesh = fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
-        known = self.run.read_splat_std()
-        return mesh if known is None else with_std(mesh, *known)
-
-
-def with_std(mesh: Mesh, field: GaussianField, std: SplatStd) -> Mesh:
-    """Return a mesh in the frame of a map with the depth_std_m of the nearest opaque splat at each vertex; the mesh
-    unchanged if no splat is opaque."""
-    nearest = nearest_opaque(field, mesh.vertices.astype(np.float64))
-    return mesh if nearest is None else replace(mesh, depth_std_m=std.depth_std_m.numpy()[nearest].astype(np.float32))
+        field, std = self.run.read_splat_std() or (None, None)
+        nearest = None if field is None else nearest_opaque(field, mesh.vertices.astype(np.float64))
+        if std is None or nearest is None:
+            return mesh
+        return replace(mesh, depth_std_m=std.depth_std_m.numpy()[nearest].astype(np.float32))
 
 
 def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | None:

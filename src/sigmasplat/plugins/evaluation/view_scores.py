@@ -210,10 +210,9 @@ def kind_scores(final: Mapping[str, ViewScores], before: Mapping[str, ViewScores
     """Return the mean scores of each kind of views in the final map, and in their submaps (None if they are not
     kept)."""
     kept = maps.T_world_submap is not None
-    names = {kind: kind.replace("-", "_") for kind in final}
-    return {name: mean_scores(final[kind].rows) for kind, name in names.items()} | {
-        f"{name}_submaps": mean_scores(before[kind].rows) if kept else None for kind, name in names.items()
-    }
+    found: dict[str, Any] = {kind: mean_scores(final[kind].rows) for kind in final}
+    found |= {f"{kind}_submaps": mean_scores(before[kind].rows) if kept else None for kind in final}
+    return {name.replace("-", "_"): scores for name, scores in found.items()}
 
 
 def score_uncertainty(samples: list[NDArray[np.float32]], judged_on: str = "held-out") -> dict[str, Any] | None:
