@@ -35,6 +35,10 @@ INVERSE = (
     "planes show that depth is stored as inverse depth (disparity), which grows with nearness; export metres, or give "
     "the folder of the depth images: --predicted-depth FOLDER --predicted-inverse"
 )
+NORMALISED = (
+    "the largest value of every image is 1, so depth is normalised, not in metres; if 1 is the same distance in all, "
+    "such as 10 m: --depth-scale 0.1; otherwise give the folder of the depth images: --predicted-depth FOLDER"
+)
 
 Values = NDArray[np.float64]
 Image = NDArray[np.float32]
@@ -53,6 +57,13 @@ def thinned(depth_m: Image) -> Image:
     """Return every n-th pixel of an image [H, W], about `COLUMNS` columns."""
     step = max(1, depth_m.shape[1] // COLUMNS)
     return depth_m[step // 2 :: step, step // 2 :: step].copy()
+
+
+def ends_at_one(depth_m: Image) -> bool:
+    """Return whether float depth [H, W] ends at exactly 1, and not in whole millimetres: a scene that is cut off at 1 m
+    ends a little before it, unless its readings are rounded."""
+    millimetres = 1000 * depth_m
+    return abs(float(depth_m.max()) - 1) < 1e-6 and bool((np.abs(millimetres - np.rint(millimetres)) > 0.01).any())
 
 
 def meaning_of(images: Sequence[Image], camera: Camera, units_per_metre: float, along: str) -> Meaning:

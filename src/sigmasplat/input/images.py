@@ -80,13 +80,20 @@ def depth_values(path: Path) -> NDArray[Any]:
     return {".npy": read_npy, ".npz": read_npz, ".exr": read_exr}.get(path.suffix.lower(), read_values)(path)
 
 
-def read_depth(path: Path, units_per_metre: float) -> NDArray[np.float32]:
+def read_depth(path: Path, units_per_metre: float, confidence: Path | None = None) -> NDArray[np.float32]:
     """Read depth along the optical axis as float32 metres [H, W], 0 = no reading.
 
     Whole numbers (16-bit PNG, integer .npy) are divided by `units_per_metre`; floats (.tiff, .npy, .exr) are in metres.
-    Raises SourceError if the file is unreadable, not a single-channel depth image, negative, or holds NaN or inf.
+    confidence: an image whose zeros mark readings to ignore; it may be missing. Raises SourceError if a file is
+    unreadable, not a single-channel depth image, negative, or holds NaN or inf.
     """
-    return depth_to_metres(path, depth_values(path), units_per_metre)
+    depth_m = depth_to_metres(path, depth_values(path), units_per_metre)
+    if confidence is None or not confidence.is_file():
+        return depth_m
+    sure = read_values(confidence)
+    if sure.shape != depth_m.shape:
+        raise SourceError(f"{confidence}: {sure.shape} values for depth of {depth_m.shape}; copy it again")
+    return np.where(sure > 0, depth_m, np.float32(0.0))
 
 
 def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:

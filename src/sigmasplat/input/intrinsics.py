@@ -11,9 +11,12 @@ from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import Calibration, Origin, build_camera
 
 NAMES = re.compile(
-    r"(cam(era)?|colou?r|rgb|calib\w*|ost|k|tum\d|focal|(\w*[-_])?(intrinsics?|camera_info|cam(era)?_k)(_\w+)?)"
+    r"(cam(era)?|colou?r|rgb|calib\w*|sensors|ost|k|tum\d|focal"
+    r"|(\w*[-_])?(intrinsics?|camera_info|cam(era)?_k)(_\w+)?)"
 )
-"""Names of files, without their ending: of ROS, kalibr, ORB-SLAM, BOP, 3DMatch, SUN3D, DROID-SLAM and others."""
+"""Names of files, without their ending: of ROS, kalibr, ORB-SLAM, BOP, 3DMatch, SUN3D, OpenLORIS and others."""
+OPENLORIS = r"(?ms)^d400_color_optical_frame:(.*?)(?=^\S|\Z)"
+"""The colour camera of OpenLORIS among its sensors; the order of its intrinsics is fx, cx, fy, cy."""
 ENDINGS = (".txt", ".yaml", ".yml", ".json", ".csv", ".cfg")
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 MATRICES = r"(?:camera_matrix|cam_k|intrinsic_matrix|intrinsics?|k)"
@@ -41,6 +44,8 @@ def intrinsics_beside(folder: Path, settings: InputConfig, size: Size, units: fl
 
 
 def _calibration(path: Path, text: str, size: Size, units: float) -> Calibration | None:
+    loris = re.search(OPENLORIS, text)
+    text = loris[1] if loris else text
     named = [_numbers(text, rf"(?:\w*[._])?{key}")[:1] for key in ("fx", "fy", "cx", "cy")]
     focal, lens = [number for found in named for number in found], _numbers(text, LENSES)[:5]
     lens = lens or [n for key in ("k1", "k2", "p1", "p2", "k3") for n in _numbers(text, rf"(?:\w*[._])?{key}")[:1]]
@@ -48,7 +53,8 @@ def _calibration(path: Path, text: str, size: Size, units: float) -> Calibration
         plain = [float(word) for word in re.findall(NUMBER, text)] if not re.search(r"[a-df-z]", text) else []
         if path.stem.lower() == "focal" and len(plain) == 1:
             plain = [*plain, *plain, (size[0] - 1) / 2, (size[1] - 1) / 2]
-        focal, rest = _focal(_numbers(text, MATRICES) or plain)
+        listed = _numbers(text, MATRICES) or plain
+        focal, rest = _focal([listed[i] for i in (0, 2, 1, 3)] if loris and len(listed) == 4 else listed)
         lens = lens or rest
     if len(focal) != 4 or not all(np.isfinite(focal)):
         return None

@@ -14,7 +14,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.trajectory import Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
-from sigmasplat.input.calibration import Origin
+from sigmasplat.input.calibration import ASSUMED, Origin
 from sigmasplat.types import Matrix
 
 MOST_MATRIX_BYTES = 1 << 16
@@ -113,6 +113,15 @@ def read_groundtruth(folder: Path) -> Trajectory | None:
     stop the run before it starts, not its evaluation an hour later."""
     path = folder / "groundtruth.txt"
     return read_poses(path) if exists(path) else None
+
+
+POSES = re.compile(r"(cam(era)?_?)?(poses?|traj(ectory)?|odometry)[-\w]*\.(txt|csv|log)")
+
+
+def poses_beside(folder: Path) -> dict[str, Origin]:
+    """Return that a file of a folder that is named as poses are is not read, with what reads it; empty without one."""
+    path = next((path for path in sorted(folder.glob("*.*")) if POSES.fullmatch(path.name.lower())), None)
+    return {"poses": Origin(f"none, {path.name} is not read", ASSUMED, f"--poses {path}")} if path else {}
 
 
 def read_lines(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -18,11 +18,12 @@ from sigmasplat.data.images import resized_color
 from sigmasplat.data.trajectory import Trajectory, evenly_spaced
 from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import ASSUMED, MEASURED, Calibration, Origin, resolve_calibration
-from sigmasplat.input.depth_meaning import MOST_PIXELS, SAMPLES, meaning_of, thinned
+from sigmasplat.input.depth_meaning import MOST_PIXELS, NORMALISED, SAMPLES, ends_at_one, meaning_of, thinned
 from sigmasplat.input.given import SAME_SHAPE
 from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
 from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.intrinsics import intrinsics_beside
+from sigmasplat.input.lists import poses_beside
 from sigmasplat.input.rectification import Rectification, check_image_sizes, resampled, turned_by_tag
 from sigmasplat.input.source import Source
 
@@ -99,7 +100,8 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The colour and the depth file of one frame, its time, and how much later the depth is, in seconds.
+    """The colour and the depth file of one frame, its time, how much later the depth is, in seconds, and the image of
+    the confidence of its readings (`read_depth`).
 
     Formats whose images are not separate files (members of an archive, frames of a video, messages of a bag) derive
     from this class and override the readers; the paths then only name the images in error messages.
@@ -109,6 +111,7 @@ class ImagePair:
     color: Path
     depth: Path
     depth_late_s: float = field(default=0.0, kw_only=True)
+    confidence: Path | None = field(default=None, kw_only=True)
 
     def read_color(self) -> NDArray[Any]:
         """Read 8-bit RGB [H, W, 3], or gray of more bits as stored [H, W]. Raises SourceError naming `color`."""
@@ -116,7 +119,7 @@ class ImagePair:
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
-        return read_depth(self.depth, units_per_metre)
+        return read_depth(self.depth, units_per_metre, self.confidence)
 
     def read(self, units_per_metre: float) -> tuple[NDArray[Any], NDArray[np.float32]]:
         """Read both images, as `read_color` and `read_depth` do."""
@@ -249,17 +252,19 @@ class RecordedSource(Source):
 
     def _look_at_depth(self, along: str) -> None:
         """Find out from a few images what depth values mean, and read them so."""
-        found, images = self._rectified, list[NDArray[np.float32]]()
+        found, images, ones = self._rectified, list[NDArray[np.float32]](), list[bool]()
         count = min(SAMPLES, max(3, MOST_PIXELS // int(np.prod(found.depth_size))))
         for i in evenly_spaced(len(self), count if along != "z" else 0):
             with suppress(SourceError):  # reported when the source is iterated
                 depth_m = self._in_metres(self._images[i].read_depth(self._units))
+                ones.append(self.depth_units_per_metre is None and ends_at_one(depth_m))
                 if depth_m.shape[::-1] == found.depth_size:
                     images.append(thinned(found.without_lens(depth_m)))
         meaning = meaning_of(images, found.depth_camera, self._units, along)
         found.beyond_m = meaning.beyond_m
         found.ray_lengths = found.depth_camera.ray_lengths() if meaning.ray else None
-        self.origins, self.depth_doubts = meaning.origins | self.origins, meaning.doubts
+        self.origins = meaning.origins | self.origins
+        self.depth_doubts = meaning.doubts + [NORMALISED] * (len(ones) > 2 and all(ones))
 
     def _refuse_other_clock(self) -> None:
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
@@ -286,6 +291,8 @@ def folder_source(
     known = known or intrinsics_beside(folder, settings, size, units_per_metre)
     calibration = resolve_calibration(folder, known, size, settings, units_per_metre)
     camera, lens = calibration.camera, calibration.distortion
+    if truth is None and not settings.poses:
+        more["origins"] = {**more.get("origins", {}), **poses_beside(folder)}
     if known and known.own and camera != known.camera:
         calibration = replace(calibration, own=())  # one camera is given for all frames
     if not calibration.depth_camera:

@@ -185,8 +185,8 @@ COLOR_FORMS: dict[str, tuple[int, Sequence[int] | str]] = {
     **{name: (2, "COLOR_YUV2RGB_YUY2") for name in ("yuv422_yuy2", "yuyv")},
     **{f"bayer_{order}8": (1, f"COLOR_Bayer{order.upper()}2RGB") for order in ("rggb", "bggr", "gbrg", "grbg")},
 }
-"""Channels of an image, and the positions of red, green and blue in a pixel, or OpenCV's conversion. Images of 16 bits,
-such as rgb16, are read as those of 8."""
+"""Channels of an image, and the positions of red, green and blue in a pixel, or OpenCV's conversion. Colours of 16
+bits, such as rgb16, are read as those of 8; gray of 16 bits stays as stored."""
 DEPTH_TYPE = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 HEADER_BYTES = 12
 
@@ -210,15 +210,19 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
     return image_size(path, data[start:])
 
 
-def decode_color_message(path: Path, message: Message) -> NDArray[np.uint8]:
-    """Return 8-bit RGB [H, W, 3]. Raises SourceError naming `path` if the message is damaged or not colour."""
+def decode_color_message(path: Path, message: Message) -> NDArray[Any]:
+    """Return 8-bit RGB [H, W, 3], or gray of more bits [H, W], as `read_color`. Raises SourceError naming `path` if the
+    message is damaged or not colour."""
     if not hasattr(message, "encoding"):
         return read_color(path, message.data.tobytes())
     wide, name = "16" in message.encoding, message.encoding.replace("16", "8")
     if name not in COLOR_FORMS:
         raise _encoding(path, "colour", message.encoding, COLOR_FORMS)
     channels, order = COLOR_FORMS[name]
-    pixels = (_pixels(path, message, "u2" if wide else "u1", channels) >> (8 * wide)).astype(np.uint8)
+    stored = _pixels(path, message, "u2" if wide else "u1", channels)
+    if wide and order == (0, 0, 0):
+        return stored[..., 0]
+    pixels = (stored >> (8 * wide)).astype(np.uint8)
     if isinstance(order, str):
         return np.asarray(opencv().cvtColor(pixels, getattr(opencv(), order)), np.uint8)
     return np.ascontiguousarray(pixels[..., order])

@@ -1,4 +1,5 @@
-"""Read a folder of nerfstudio or instant-ngp (NeRFCapture) with depth, transforms.json, and raw exports of Polycam.
+"""Read a folder of nerfstudio or instant-ngp (NeRFCapture) with depth, transforms.json, and raw exports of Polycam and
+of 3d Scanner App.
 
 transforms.json        see `input/transforms.py`; depth_unit_scale_factor or integer_depth_scale is metres per unit,
                        default 0.001; timestamp in every frame, or times in the names, else 1/30 s apart
@@ -7,6 +8,11 @@ images/…  depths/…     file_path and depth_file_path or depth_path, relative
 keyframes/cameras/TIME.json  images/TIME.jpg  depth/TIME.png     Polycam: time in µs, fx fy cx cy width height, t_00 …
                        t_23 (camera to world, ARKit's axes), depth in mm; corrected_cameras/ and corrected_images/, if
                        they exist, have better poses and no lens distortion (layout: PolyCam/polyform)
+keyframes/confidence/TIME.png          0, 54 or 255: readings with 0 are ignored
+
+frame_00000.json  frame_00000.jpg      3d Scanner App, "All Data": cameraPoseARFrame (16 numbers by rows, camera to
+depth_00000.png  conf_00000.png        world, ARKit's axes), intrinsics (9 numbers by rows), time in s; depth in mm,
+                                       confidence 0 to 2; only some frames have a colour image
 
 If depth has another size than colour (as on phones), both are assumed to share one camera.
 """
@@ -70,7 +76,9 @@ def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig, by: s
     if (stamps_s := seconds_of(stamps, bool((stamps % 1).any()))) is not None:
         times_s, times = stamps_s, read._replace(value="timestamp of each frame")
     order = np.argsort(times_s)
-    frames, images = [frames[i] for i in order], [ImagePair(float(times_s[i]), *files[i]) for i in order]
+    frames, files, times_s = [frames[i] for i in order], [files[i] for i in order], times_s[order]
+    sure = [folder / frame["confidence"] if "confidence" in frame else None for frame in frames]
+    images = [ImagePair(float(t), *pair, confidence=c) for t, pair, c in zip(times_s, files, sure, strict=True)]
     key = next((key for key in UNIT_KEYS if key in fields), "")
     units = round(1.0 / check_positive(path, key, json_number(path, fields, key, METRES_PER_UNIT)), 6)
     known = read_transforms_camera(path, fields, frames, first_size([i.color for i in images]), units)
@@ -97,11 +105,29 @@ def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
     for path in list_images(folder / f"{kind}cameras", (".json",)):
         number = partial(json_number, path, read_json_object(path))
         frame: Fields = {"file_path": f"{kind}images/{path.stem}.jpg", DEPTH: f"depth/{path.stem}.png"}
+        frame |= {"confidence": f"confidence/{path.stem}.png"}
         frame |= {"fl_x": number("fx"), "fl_y": number("fy"), "w": number("width"), "h": number("height")}
         frame |= {key: number(key) + 0.5 for key in ("cx", "cy")}  # ARKit measures from the centre of the first pixel
         frame |= {"transform_matrix": [number(f"t_{i // 4}{i % 4}") for i in range(12)]}
         frames.append(frame | ({"timestamp": int(path.stem) * 1e-6} if path.stem.isdecimal() else {}))
     return _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings, "ARKit")
+
+
+def open_3d_scanner_app(place: str, settings: InputConfig) -> RecordedSource:
+    """Open a folder of the export "All Data". Raises SourceError as `open_nerfstudio`."""
+    folder, frames = Path(place), list[Fields]()
+    for path in sorted(folder.glob("frame_*.json")):
+        if path.with_suffix(".jpg").is_file():
+            fields, number = read_json_object(path), path.stem.removeprefix("frame_")
+            flat = fields.get("intrinsics")
+            K = {f"intrinsics, number {i}": n for i, n in enumerate(flat)} if isinstance(flat, list) else {}
+            fx, cx, fy, cy = (json_number(path, K, f"intrinsics, number {i}") for i in (0, 2, 4, 5))
+            frame: Fields = {"file_path": f"{path.stem}.jpg", DEPTH: f"depth_{number}.png"}
+            frame |= {"confidence": f"conf_{number}.png", "transform_matrix": fields.get("cameraPoseARFrame")}
+            frames.append(
+                frame | {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "timestamp": fields.get("time")}
+            )
+    return _open(folder, folder / "frame_*.json", {"frames": frames}, settings, "ARKit")
 
 
 def _keyframes(place: str) -> Path:
@@ -115,5 +141,10 @@ PLUGIN = (
         "Polycam", "keyframes/ with images/, depth/ and cameras/*.json",
         lambda path: (_keyframes(path) / "depth").is_dir() and any((_keyframes(path) / "cameras").glob("*.json")),
         open_polycam, sensor="lidar-iphone",
+    ),
+    SourceFormat(
+        "3d Scanner App", "frame_00000.json, frame_00000.jpg and depth_00000.png",
+        lambda path: any(Path(path).glob("frame_*.json")) and any(Path(path).glob("depth_*.png")),
+        open_3d_scanner_app, sensor="lidar-iphone",
     ),
 )  # fmt: skip

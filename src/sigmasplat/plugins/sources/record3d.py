@@ -1,6 +1,7 @@
 """Read iPhone recordings of the app Record3D: .r3d files, and folders of its export "EXR + RGB".
 
-.r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes
+.r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes; also if
+               it was unpacked and packed again, with its folder, or lies alone in a folder
 the export:    metadata.json     rgb/0.jpg    depth/0.exr
 
 metadata: w, h, dw, dh (sizes in pixels), K (3×3 by columns), fps, frameTimestamps (seconds), perFrameIntrinsicCoeffs
@@ -12,6 +13,7 @@ issues 7 and 27; nerfstudio, record3d_utils.py. Depth has fewer pixels than colo
 import re
 import zipfile
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +53,8 @@ MOST_MEMBER_BYTES = 128 << 20
 
 
 class Archive:
-    """The files of a zip archive or of its unpacked folder, by relative name; nothing is unpacked to disk."""
+    """The files of a zip archive or of its unpacked folder, by name relative to the metadata; nothing is unpacked to
+    disk."""
 
     def __init__(self, path: Path) -> None:
         """List the files. Raises SourceError if a file is not a complete zip archive."""
@@ -61,7 +64,9 @@ class Archive:
             return
         with guarded(path, "copy it again", SourceError, "not a complete zip archive"):
             self._zip = zipfile.ZipFile(path)
-        self.names = self._zip.namelist()
+        listed = self._zip.namelist()
+        self._inner = next((n.removesuffix("metadata") for n in listed if n.endswith("/metadata")), "")
+        self.names = [name.removeprefix(self._inner) for name in listed]
 
     def __contains__(self, name: str) -> bool:
         return name in self.names
@@ -73,7 +78,7 @@ class Archive:
         if self._zip is None:
             return read_bytes(where, SourceError, most)
         failed = "cannot be read from its archive"
-        with guarded(where, "copy it again", SourceError, failed), self._zip.open(name) as member:
+        with guarded(where, "copy it again", SourceError, failed), self._zip.open(self._inner + name) as member:
             data = member.read(most + 1)
         if len(data) > most:
             raise SourceError(f"{where}: unzips to more than {most / 1e6:.0f} MB; is it the right file?")
@@ -122,7 +127,7 @@ class R3dImagePair(ImagePair):
 
 def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
-    path = Path(place)
+    path = _packed(Path(place))
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive else "metadata"
     metadata = parse_json(archive.read(name, MOST_JSON_BYTES), path / name)
@@ -207,14 +212,20 @@ def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArra
     return rows
 
 
+def _packed(place: Path) -> Path:
+    """Return the only .r3d file of a folder, else the place itself."""
+    files = [path for path in place.glob("*.r3d") if path.is_file()]
+    return files[0] if len(files) == 1 else place
+
+
 def _recognises(path: str) -> bool:
-    place = Path(path)
+    place = _packed(Path(path))
+    if place.suffix.lower() == ".r3d" and place.is_file():
+        return True
     if place.is_file():
-        try:
-            with zipfile.ZipFile(place) as archive:
-                return any(name.startswith("rgbd/") for name in archive.namelist())
-        except DAMAGED:
-            return place.suffix.lower() == ".r3d"
+        with suppress(*DAMAGED), zipfile.ZipFile(place) as archive:
+            return any("rgbd/" in name for name in archive.namelist())
+        return False
     return any((place / "rgbd").glob("*.depth")) or (
         (place / "metadata.json").is_file() and any((place / "depth").glob("*.exr"))
     )

@@ -11,6 +11,7 @@ images, or the recording time if the headers fit no image.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ class BagImagePair(ImagePair):
     topics: tuple[str, str]
     entries: tuple[Entry, Entry]
 
-    def read_color(self) -> NDArray[np.uint8]:
+    def read_color(self) -> NDArray[Any]:
         return bag_messages.decode_color_message(self.color, self._message(0))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:

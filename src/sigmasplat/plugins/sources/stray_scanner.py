@@ -38,9 +38,7 @@ from sigmasplat.api import (
     image_size,
     median_calibration,
     parse_numbers,
-    read_depth,
     read_lines,
-    read_values,
     se3,
 )
 
@@ -55,26 +53,13 @@ Rows = dict[int, dict[str, float]]
 
 @dataclass(frozen=True)
 class StrayImagePair(ImagePair):
-    """A frame of the video, a depth image, and the confidence of each reading."""
+    """A frame of the video, and a depth image."""
 
     video: Video
     number: int
-    confidence: Path
 
     def read_color(self) -> NDArray[np.uint8]:
         return self.video.frame(self.number)
-
-    def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
-        """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the file."""
-        depth_m = read_depth(self.depth, units_per_metre)
-        if not self.confidence.is_file():
-            return depth_m
-        confidence = read_values(self.confidence)
-        if confidence.shape != depth_m.shape:
-            raise SourceError(
-                f"{self.confidence}: {confidence.shape} values for depth of {depth_m.shape}; copy it again"
-            )
-        return np.where(confidence > 0, depth_m, np.float32(0.0))
 
     def sizes(self) -> tuple[Size, Size]:
         return self.video.size, image_size(self.depth)
@@ -98,7 +83,7 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
         )
     images = [
         StrayImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
-                      folder / "confidence" / depths[n].name)
+                      confidence=folder / "confidence" / depths[n].name)
         for n in numbers
     ]  # fmt: skip
     kept = set(numbers)
