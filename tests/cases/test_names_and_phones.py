@@ -1,4 +1,4 @@
-"""File names that hold times, and recordings of phone apps: times, pairs, intrinsics per frame, shapes, Polycam."""
+"""File names that hold times, and recordings of phone apps: times, pairs, intrinsics per frame, shapes."""
 
 import json
 from collections.abc import Callable
@@ -307,43 +307,3 @@ def test_another_shape_needs_the_depth_camera(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("height", "width"), [(5, 7), (9, 12), (24, 31)])
 def test_rounded_sizes_of_small_depth_are_one_shape(height: int, width: int, tmp_path: Path) -> None:
     assert len(open_source(with_depth(tmp_path, height, width))) == FRAMES
-
-
-# Polycam
-
-
-KEYS = 5_603_927_833, 5_604_211_000, 5_605_100_000, 5_605_700_000
-
-
-def polycam(folder: Path, kind: str = "") -> Path:
-    """Write a raw export: depth with half of the pixels, and a camera file for each image."""
-    seen = sample((64, 48))
-    for n, key in enumerate(KEYS):
-        layouts.save(folder / f"keyframes/{kind}images/{key}.jpg", seen.color[n])
-        layouts.save(folder / f"keyframes/depth/{key}.png", seen.depth_mm[n, ::2, ::2])
-        pose = np.array(layouts.opengl(seen.T_world_camera[n]))
-        fields = {f"t_{i}{j}": pose[i, j] for i in range(3) for j in range(4)}
-        fields |= {"fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "blur_score": 9.0}
-        layouts.save_text(folder / f"keyframes/{kind}cameras/{key}.json", json.dumps(fields))
-    return folder
-
-
-@pytest.mark.parametrize("inner", ["", "keyframes"])
-def test_polycams_raw_export(inner: str, tmp_path: Path) -> None:
-    folder, seen = polycam(tmp_path / "scan"), sample((64, 48))
-    source = open_source(folder / inner)
-    assert (len(source), source.camera.fx, source.camera.width, source.sensor) == (4, 25.0, 32, "lidar-iphone")
-    times_s = [source.timestamp_s(i) for i in range(4)]
-    assert times_s == pytest.approx([5603.927833, 5604.211, 5605.1, 5605.7])
-    assert source.frame(1).depth_m[20, 20] == pytest.approx(seen.depth_mm[1, 40, 40] / 1000, abs=0.02)
-    path = source.device_path()
-    assert path is not None
-    np.testing.assert_allclose(path.T_world_camera, seen.T_world_camera, atol=1e-9)
-
-
-def test_polycams_corrected_files_are_preferred_and_lost_depth_is_named(tmp_path: Path) -> None:
-    folder = polycam(polycam(tmp_path / "scan"), "corrected_")
-    (folder / "keyframes/depth/5605100000.png").unlink()
-    source = open_source(folder)
-    assert len(list(source)) == 3 and "5605100000" in source.skipped[0]
-    assert "corrected_cameras" in source.origins["pairs"].origin
