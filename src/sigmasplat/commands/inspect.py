@@ -34,7 +34,8 @@ def inspect(
     from sigmasplat.run.terminal import Screen
 
     screen = Screen()
-    found = inspect_source(path, configured(default_preset(), settings, None, input_options).input)
+    config = configured(default_preset(), settings, None, input_options)
+    found = inspect_source(path, config.input, exposure=config.tracking.exposure)
     table = Table(title=found.title, show_header=False)
     for name, value in found.rows:
         table.add_row(name, value)

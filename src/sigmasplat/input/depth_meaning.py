@@ -14,6 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from sigmasplat.config import InputConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.input.calibration import ALONG_RAY, ASSUMED, GIVEN, MEASURED, Origin
 
@@ -66,11 +67,12 @@ def ends_at_one(depth_m: Image) -> bool:
     return abs(float(depth_m.max()) - 1) < 1e-6 and bool((np.abs(millimetres - np.rint(millimetres)) > 0.01).any())
 
 
-def meaning_of(images: Sequence[Image], camera: Camera, units_per_metre: float, along: str) -> Meaning:
-    """Return what the values of thinned depth images, m, mean. Without images it is what `along` says.
+def meaning_of(images: Sequence[Image], camera: Camera, units_per_metre: float, settings: InputConfig) -> Meaning:
+    """Return what the values of thinned depth images, m, mean. Without images it is what `depth_along` says.
 
-    camera: of the whole images, without lens distortion; along: as `InputConfig.depth_along`.
+    camera: of the whole images, without lens distortion.
     """
+    along = settings.depth_along
     most, share, sure = spike_of(images, units_per_metre)
     known, doubts = dict[str, Origin](), list[str]()
     if share:
@@ -79,7 +81,7 @@ def meaning_of(images: Sequence[Image], camera: Camera, units_per_metre: float, 
         if sure:
             dropped = f"{words}; these and larger ones are dropped (--set input.depth_along=z keeps them)"
             known["farthest depth"] = Origin(dropped, MEASURED)
-        else:
+        elif most <= settings.max_depth_m:
             doubts.append(f"{words}; if these are no readings: --set input.max_depth_m={0.999 * most:.3f}")
     is_ray, origin = along == "ray", GIVEN
     if along == "auto":

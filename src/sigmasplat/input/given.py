@@ -65,6 +65,7 @@ class Masked(Subset):
         if whole.live:
             raise SourceError(f"{folder}: masks are for recordings only; record the camera, then run the recording")
         super().__init__(whole, InputConfig())
+        self.origins = {name: origin for name, origin in self.origins.items() if name != "transparency"}
         if not folder.is_dir():
             raise SourceError(f"no such folder: {folder}; give the folder of the masks, one image for each frame")
         self._masks, c = list_images(folder, COLOR_ENDINGS), whole.camera

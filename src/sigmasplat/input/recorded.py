@@ -52,8 +52,9 @@ def depth_warning(source: Source, samples: int = 5, read: Sequence[Frame] = ()) 
     low, high = PLAUSIBLE_MEDIAN_M
     if low <= median_m <= high:
         return None
+    median = np.format_float_positional(median_m, 4, fractional=False, trim="-")
     return (
-        f"{source.name}: median depth is {median_m:.4g} m over {len(medians)} frames, outside {low}–{high} m; "
+        f"{source.name}: median depth is {median} m over {len(medians)} frames, outside {low}–{high} m; "
         f"the depth's scale looks wrong{_unit_guess(median_m, source.depth_units_per_metre)}"
     )
 
@@ -167,7 +168,7 @@ class RecordedSource(Source):
             self.origins["depth unit"] = Origin("metres, as usual for floats", ASSUMED, "--depth-scale UNITS")
         self._refuse_other_clock()
         if not (settings.predicted_depth or self.computed_depth):
-            self._look_at_depth(settings.depth_along)
+            self._look_at_depth(settings)
         refuse_without_depth(self)
 
     def __len__(self) -> int:
@@ -250,17 +251,17 @@ class RecordedSource(Source):
         gray = np.clip(recorded * (256.0 / self._white), 0.0, 255.0).astype(np.uint8)
         return np.repeat(gray[..., None], 3, axis=2)
 
-    def _look_at_depth(self, along: str) -> None:
+    def _look_at_depth(self, settings: InputConfig) -> None:
         """Find out from a few images what depth values mean, and read them so."""
         found, images, ones = self._rectified, list[NDArray[np.float32]](), list[bool]()
         count = min(SAMPLES, max(3, MOST_PIXELS // int(np.prod(found.depth_size))))
-        for i in evenly_spaced(len(self), count if along != "z" else 0):
+        for i in evenly_spaced(len(self), count if settings.depth_along != "z" else 0):
             with suppress(SourceError):  # reported when the source is iterated
                 depth_m = self._in_metres(self._images[i].read_depth(self._units))
                 ones.append(self.depth_units_per_metre is None and ends_at_one(depth_m))
                 if depth_m.shape[::-1] == found.depth_size:
                     images.append(thinned(found.without_lens(depth_m)))
-        meaning = meaning_of(images, found.depth_camera, self._units, along)
+        meaning = meaning_of(images, found.depth_camera, self._units, settings)
         found.beyond_m = meaning.beyond_m
         found.ray_lengths = found.depth_camera.ray_lengths() if meaning.ray else None
         self.origins = meaning.origins | self.origins

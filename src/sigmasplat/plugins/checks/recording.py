@@ -65,8 +65,11 @@ class Inspection:
         }
 
 
-def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPLES) -> Inspection:
-    """Open a recording and inspect `samples` frames, evenly spaced. Raises SourceError if it cannot be opened."""
+def inspect_source(
+    path: str | Path, settings: InputConfig, samples: int = SAMPLES, exposure: bool = False
+) -> Inspection:
+    """Open a recording and inspect `samples` frames, evenly spaced; exposure: whether a run will fit it. Raises
+    SourceError if it cannot be opened."""
     name, (source, guessed) = format_name(path, settings), _opened(path, settings)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     consecutive, frames = range(first, min(first + CONSECUTIVE, len(source))), list[Frame]()
@@ -78,7 +81,7 @@ def inspect_source(path: str | Path, settings: InputConfig, samples: int = SAMPL
     times_s = times_of(source)
     warnings = [
         *guessed, *filter(None, [unlikely_camera(source.camera)]), *time_warnings(times_s),
-        *_warnings(source, frames, settings, agreement), *motion_warnings(motion, first),
+        *_warnings(source, frames, settings, agreement, exposure), *motion_warnings(motion, first),
     ]  # fmt: skip
     rows = [
         ("format", name), *_size_rows(source, times_s), *_depth_rows(source, frames, settings),
@@ -197,7 +200,7 @@ def _holes(frames: list[Frame]) -> float:
 
 
 def _warnings(
-    source: Source, frames: list[Frame], settings: InputConfig, agreement: EdgeAgreement | None
+    source: Source, frames: list[Frame], settings: InputConfig, agreement: EdgeAgreement | None, exposure: bool
 ) -> Iterator[str]:
     unused, every = len(source.skipped), len(source) + len(source.skipped)
     if unused > MANY_UNUSED * every:
@@ -216,7 +219,7 @@ def _warnings(
     brightness = np.array([frame.color.mean() for frame in frames])
     mean = max(float(brightness.mean()), 1e-6)
     steps = np.abs(np.diff(brightness)) / mean
-    if len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
+    if not exposure and len(steps) and float(np.median(steps)) > MAX_BRIGHTNESS_STEP:
         change = float(np.ptp(brightness) / mean)
         yield f"brightness changes by {change:.0%}; if exposure is automatic: --set tracking.exposure=true"
 

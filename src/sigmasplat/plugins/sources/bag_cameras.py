@@ -6,6 +6,7 @@ Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera
 """
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -177,7 +178,9 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 
     Raises SourceError if the colour camera is unknown, or if the pose of a separate depth camera is unknown.
     """
-    optics = read_optics(bag, color)
+    optics = None
+    with suppress(*[SourceError] * bool(settings.calibration)):  # that of the file replaces it
+        optics = read_optics(bag, color)
     units = _depth_units(bag, depth)
     recorded = Calibration(optics[0], units, optics[1]) if optics else None
     calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
