@@ -1,8 +1,9 @@
 """Each remedy that is printed for a recording works as printed: an input triggers the message, the printed option is
 given to the same command with the words in capitals filled in, or the printed file is written, and the message is gone.
 
-Remedies that other tests follow: EXIF tags (test_image_files), lists instead of names (test_names_and_phones), encodings
-of bags (test_lists_and_bags), commands after a run (test_ends), `calibrate` (tests/system/test_calibrate)."""
+Remedies that other tests follow: EXIF tags (test_image_files), lists instead of names (test_names_and_phones),
+encodings of bags (test_lists_and_bags), commands after a run (test_ends), `calibrate` and the scale of poses
+(tests/system)."""
 
 import json
 import re
@@ -21,6 +22,7 @@ from bag_recordings import CAMERA_TOPICS, FOCAL, Recorder
 from command_line import exit_code
 from recorded_room import write_images
 from recordings import r3d_members, scene, write_zip
+from sigmasplat.plugins.checks import recording
 from small_room import frame_at
 
 SEEN = [frame_at(i) for i in range(0, 200, 50)]
@@ -49,8 +51,11 @@ def room(
     """Write a plain folder of the room whose depth, m, is changed, from depth and number of a frame."""
 
     def write(folder: Path) -> Path:
-        seen = [replace(frame, depth_m=np.float32(change(frame.depth_m, i))) for i, frame in enumerate(SEEN)]
-        write_images(folder, seen)
+        seen = [
+            replace(frame, depth_m=np.clip(change(frame.depth_m, i), 0, None).astype(np.float32))
+            for i, frame in enumerate(SEEN)
+        ]
+        write_images(folder, SEEN if floats else seen)
         for i, frame in enumerate(seen if floats else []):
             (folder / f"depth/{i:04d}.png").unlink()
             np.save(folder / f"depth/{i:04d}.npy", frame.depth_m)
@@ -79,16 +84,20 @@ def holes_at_10_m(z: np.ndarray, i: int) -> np.ndarray:
     return np.where(holes, 10.0, z)
 
 
+def listed_again(folder: Path, times: Callable[[int], float], late_s: float = 0.0) -> Path:
+    for part, late in (("rgb", 0.0), ("depth", late_s)):
+        lines = [f"{times(i) + late:.6f} {part}/{i:04d}.png\n" for i in range(len(SEEN))]
+        (folder / f"{part}.txt").write_text("".join(lines))
+    return folder
+
+
 def listed(name: str, late_s: float = 0.0, times: Callable[[int], float] = lambda i: i / 15) -> Callable[[Path], Path]:
     """Write TUM's lists, in millimetres."""
 
     def write(folder: Path) -> Path:
         room()(folder / name)
         (folder / name / "color").rename(folder / name / "rgb")
-        for part, late in (("rgb", 0.0), ("depth", late_s)):
-            lines = [f"{times(i) + late:.6f} {part}/{i:04d}.png\n" for i in range(len(SEEN))]
-            (folder / name / f"{part}.txt").write_text("".join(lines))
-        return folder / name
+        return listed_again(folder / name, times, late_s)
 
     return write
 
@@ -195,8 +204,8 @@ REMEDIES = {
     "impossible focal length": Remedy(room(**CAMERA | {"fx": 3.0}), "fx = 3 pixels gives", "--fx PIXELS", ("128",)),
     "impossible focal length, y": Remedy(room(**CAMERA | {"fy": 1.0}), "fy = 1 pixels gives", "--fy PIXELS", ("128",)),
     "published camera": Remedy(
-        lambda folder: layouts.tum(folder, layouts.sample(layouts.VGA)), "camera: TUM's freiburg3", "--calibration FILE",
-        ("vga.json",),
+        lambda folder: layouts.tum(folder, layouts.sample(layouts.VGA)), "camera: TUM's freiburg3",
+        "--calibration FILE", ("vga.json",),
     ),
     "size of the calibration": Remedy(
         room(**CAMERA), r"size of the calibration: that of the images \(width and height in \S+calibration.json",
@@ -217,13 +226,15 @@ REMEDIES = {
         room(**CAMERA | {"depth_scale": 1.0}), "the depth's scale looks wrong", r"--depth-scale 1000",
     ),
     "unknown unit": Remedy(
-        room(lambda z, i: 1e6 * z, floats=True), "the depth's scale looks wrong; give", "--depth-scale UNITS", ("1e6",), FX
+        room(lambda z, i: 1e6 * z, floats=True), "the depth's scale looks wrong; give", "--depth-scale UNITS", ("1e6",),
+        FX,
     ),
     "normalised": Remedy(
         room(lambda z, i: z / z.max(), floats=True), "depth is normalised", "--depth-scale 0.1", given=FX
     ),
     "normalised, each image": Remedy(
-        room(lambda z, i: z / z.max(), floats=True), "depth is normalised", "--predicted-depth FOLDER", ("rec/depth",), FX
+        room(lambda z, i: z / z.max(), floats=True), "depth is normalised", "--predicted-depth FOLDER",
+        ("rec/depth",), FX,
     ),
     "inverse depth": Remedy(
         room(lambda z, i: 1 / np.maximum(z, 0.1)), "depth is stored as inverse depth",
@@ -239,7 +250,8 @@ REMEDIES = {
         room(wall), "if these are no readings", r"--set input.max_depth_m=[.0-9]+", given=FX + CENTRE
     ),
     "far away": Remedy(
-        room(lambda z, i: 5 * z), "are beyond 8 m and are not used", "--set input.max_depth_m=METRES", ("40",), FX + CENTRE
+        room(lambda z, i: 5 * z), "are beyond 8 m and are not used", "--set input.max_depth_m=METRES", ("40",),
+        FX + CENTRE,
     ),
     "transparency": Remedy(transparent, "transparency: ignored", "--masks FOLDER", ("masks",)),
     "poses beside": Remedy(with_poses, "poses: none, camera_pose.csv is not read", r"--poses \S+camera_pose.csv"),
@@ -252,6 +264,14 @@ REMEDIES = {
     "gaps": Remedy(
         listed("desk", times=lambda i: i / 15 + 9 * (i > 2)), "1 gaps in time", "--start and --end", ("0", "1"), FX + MM
     ),
+    "times in ms": Remedy(
+        listed("desk", times=lambda i: 66.0 * i), "frames per second; write times in seconds", given=FX + MM,
+        mended=lambda path: listed_again(path, lambda i: 0.066 * i),
+    ),
+    "times that go back": Remedy(
+        listed("desk", times=lambda i: (0.0, 0.1, 0.1001, 0.1001)[i]), "the same time as the frame before",
+        given=FX + MM, mended=lambda path: listed_again(path, lambda i: 0.1 * i),
+    ),
     "brightness": Remedy(dark_and_bright, "brightness changes by", "--set tracking.exposure=true"),
     "colour topics": Remedy(
         bag(extra=("/other/color/image_raw",)), "several topics hold colour", "--color-topic NAME",
@@ -262,7 +282,8 @@ REMEDIES = {
         ("/camera/depth/image_raw",),
     ),
     "no camera_info of depth": Remedy(
-        bag(infos=("/color/",), frames=("a", "b"), small=True), "so it cannot be registered", "--calibration FILE", ("both.json",)
+        bag(infos=("/color/",), frames=("a", "b"), small=True), "so it cannot be registered", "--calibration FILE",
+        ("both.json",),
     ),
     "no transform": Remedy(
         bag(infos=("/color/", "/depth/"), frames=("a", "b"), small=True), "no transform from the depth camera",
@@ -301,6 +322,8 @@ def test_a_printed_remedy_removes_its_complaint(
     kind: str, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "2000")
+    monkeypatch.setattr(recording, "SHOWN", 1)  # faster
+    monkeypatch.setattr(recording, "edge_agreement", lambda frames: None)
     for name, fields in FILES.items():
         (tmp_path / name).write_text(json.dumps(fields))
     remedy = REMEDIES[kind]
