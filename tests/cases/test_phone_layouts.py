@@ -111,14 +111,15 @@ def test_arkitscenes(tmp_path: Path, inner: str) -> None:
     assert len(posed) == 2 and "no pose in recorded" in posed.skipped[0]
 
 
-def test_arkitscenes_without_path_and_intrinsics_asks_for_the_camera(tmp_path: Path) -> None:
+def test_arkitscenes_without_path_depth_or_intrinsics(tmp_path: Path) -> None:
     folder = arkitscenes(tmp_path / "41069021")
     (folder / "lowres_wide.traj").unlink()
     assert open_source(folder).truth() is None
+    (folder / "lowres_depth/41069021_306.608.png").unlink()
+    assert len(open_source(folder)) == FRAMES - 1 and "306.608.png has no depth" in open_source(folder).skipped[0]
     shutil.rmtree(folder / "lowres_wide_intrinsics")
-    with pytest.raises(SourceError, match="camera unknown"):
+    with pytest.raises(SourceError, match="no .pincam in lowres_wide_intrinsics; download both"):
         open_source(folder)
-    assert len(open_source(folder, fx=25.0)) == FRAMES
 
 
 @pytest.mark.parametrize("name", ["lowres_wide.traj", "lowres_wide_intrinsics/41069021_306.507.pincam"])
@@ -128,6 +129,16 @@ def test_damaged_text_of_arkitscenes_is_named(tmp_path: Path, name: str) -> None
     with pytest.raises(SourceError, match=r"expected lines of \d numbers, found \[3\]; download it again") as refused:
         open_source(folder)
     assert name in str(refused.value)
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("value", ["1e300", "-1e160", "99"])
+def test_a_pose_of_arkitscenes_that_is_none_is_left_out(tmp_path: Path, value: str) -> None:
+    folder = arkitscenes(tmp_path / "41069021")
+    lines = (folder / "lowres_wide.traj").read_text()
+    (folder / "lowres_wide.traj").write_text(lines + f"306.7 {value} 0 0 0 0 0\n")
+    path = open_source(folder).truth()
+    assert path is not None and np.isfinite(path.T_world_camera).all() and len(path) in (2, 3)
 
 
 SENSORS = """%YAML:1.0

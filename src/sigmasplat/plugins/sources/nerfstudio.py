@@ -1,5 +1,5 @@
-"""Read a folder of nerfstudio or instant-ngp (NeRFCapture) with depth, transforms.json, and raw exports of Polycam and
-of 3d Scanner App.
+"""Read a folder of nerfstudio or instant-ngp (NeRFCapture) with depth, transforms.json, raw exports of Polycam and of
+3d Scanner App, and Apple's ARKitScenes.
 
 transforms.json        see `input/transforms.py`; depth_unit_scale_factor or integer_depth_scale is metres per unit,
                        default 0.001; timestamp in every frame, or times in the names, else 1/30 s apart
@@ -14,6 +14,10 @@ frame_00000.json  frame_00000.jpg      3d Scanner App, "All Data": cameraPoseARF
 depth_00000.png  conf_00000.png        world, ARKit's axes), intrinsics (9 numbers by rows), time in s; depth in mm,
                                        confidence 0 to 2; only some frames have a colour image
 
+lowres_wide/VIDEO_TIME.png             ARKitScenes, raw or 3dod: the same names in lowres_depth/ (mm) and confidence/;
+lowres_wide_intrinsics/*.pincam        width height fx fy cx cy, at times that may differ by 1 ms
+lowres_wide.traj                       time, rotation vector, translation in m; world to camera, ten per second
+
 If depth has another size than colour (as on phones), both are assumed to share one camera.
 """
 
@@ -22,6 +26,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sigmasplat.api import (
     Fields,
@@ -31,18 +36,23 @@ from sigmasplat.api import (
     RecordedSource,
     SourceError,
     SourceFormat,
+    Trajectory,
     build_trajectory,
     check_positive,
+    checked_pose,
     first_size,
     folder_source,
     json_number,
     list_images,
     listed_file,
     natural_key,
+    parse_numbers,
     read_frames,
     read_json_object,
+    read_lines,
     read_pose,
     read_transforms_camera,
+    se3,
     seconds_of,
     times_of_names,
 )
@@ -59,7 +69,9 @@ def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
     return _open(path.parent, path, read_json_object(path), settings)
 
 
-def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig, by: str = NAME) -> RecordedSource:
+def _open(
+    folder: Path, path: Path, fields: Fields, settings: InputConfig, by: str = NAME, truth: Trajectory | None = None
+) -> RecordedSource:
     named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
     named = [frame | {DEPTH: frame.get(DEPTH, frame.get("depth_path"))} for frame in named]
     frames = [frame for frame in named if isinstance(frame[DEPTH], str)]
@@ -83,7 +95,7 @@ def _open(folder: Path, path: Path, fields: Fields, settings: InputConfig, by: s
     units = round(1.0 / check_positive(path, key, json_number(path, fields, key, METRES_PER_UNIT)), 6)
     known = read_transforms_camera(path, fields, frames, first_size([i.color for i in images]), units)
     known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
-    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
+    truth = truth or build_trajectory(zip(times_s, (read_pose(path, frame) for frame in frames), strict=True))
     return folder_source(
         folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=by,
         origins={"times": times, "pairs": read._replace(value="named in each frame")},
@@ -122,12 +134,45 @@ def open_3d_scanner_app(place: str, settings: InputConfig) -> RecordedSource:
             flat = fields.get("intrinsics")
             K = {f"intrinsics, number {i}": n for i, n in enumerate(flat)} if isinstance(flat, list) else {}
             fx, cx, fy, cy = (json_number(path, K, f"intrinsics, number {i}") for i in (0, 2, 4, 5))
-            frame: Fields = {"file_path": f"{path.stem}.jpg", DEPTH: f"depth_{number}.png"}
-            frame |= {"confidence": f"conf_{number}.png", "transform_matrix": fields.get("cameraPoseARFrame")}
-            frames.append(
-                frame | {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "timestamp": fields.get("time")}
-            )
+            frame: Fields = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "timestamp": fields.get("time")}
+            frame |= {"file_path": f"{path.stem}.jpg", DEPTH: f"depth_{number}.png", "confidence": f"conf_{number}.png"}
+            frames.append(frame | {"transform_matrix": fields.get("cameraPoseARFrame")})
     return _open(folder, folder / "frame_*.json", {"frames": frames}, settings, "ARKit")
+
+
+def open_arkitscenes(place: str, settings: InputConfig) -> RecordedSource:
+    """Open the folder of a video. Raises SourceError as `open_nerfstudio`."""
+    folder, frames = _video(place), list[Fields]()
+    names, cameras = folder / "lowres_wide", folder / "lowres_wide_intrinsics"
+    colors, pincams = list_images(names, (".png",)), list_images(cameras, (".pincam",))
+    if not colors or not pincams:
+        raise SourceError(f"{folder}: no .png in {names.name} or no .pincam in {cameras.name}; download both")
+    times_s, path = times_of_names(pincams)[0], folder / "lowres_wide.traj"
+    nearest = np.searchsorted((times_s[1:] + times_s[:-1]) / 2, times_of_names(colors)[0])
+    for name, i in zip((color.name for color in colors), nearest, strict=True):
+        numbers = _rows(pincams[i], 6)[0] - [0, 0, 0, 0, -0.5, -0.5]
+        frame: Fields = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers.tolist(), strict=True))
+        depth = f"lowres_depth/{name}" if (folder / "lowres_depth" / name).is_file() else None
+        frames.append(frame | {"file_path": f"lowres_wide/{name}", DEPTH: depth, "confidence": f"confidence/{name}"})
+    rows = _rows(path, 7) if path.is_file() else np.zeros((0, 7))
+    T_camera_world = se3.exp_stack(np.pad(rows[:, 1:4], ((0, 0), (3, 0))))
+    T_camera_world[:, :3, 3] = rows[:, 4:]
+    poses = [checked_pose(str(path), T) for T in se3.inverse(T_camera_world)]
+    truth = build_trajectory(zip(rows[:, 0], poses, strict=True))
+    return _open(folder, cameras, {"frames": frames}, settings, "ARKit", truth)
+
+
+def _rows(path: Path, count: int) -> NDArray[np.float64]:
+    """Read lines of so many numbers [N, count]. Raises SourceError naming the file if there is none, or another."""
+    rows = [parse_numbers(path, line, words) for line, words in read_lines(path)]
+    if (found := {len(row) for row in rows}) != {count}:
+        raise SourceError(f"{path}: expected lines of {count} numbers, found {sorted(found)}; download it again")
+    return np.array(rows)
+
+
+def _video(place: str) -> Path:
+    """Return the folder itself, or that of the frames in it, as 3dod has it: VIDEO/VIDEO_frames."""
+    return next((inner.parent for inner in Path(place).glob("*_frames/lowres_wide")), Path(place))
 
 
 def _keyframes(place: str) -> Path:
@@ -146,5 +191,10 @@ PLUGIN = (
         "3d Scanner App", "frame_00000.json, frame_00000.jpg and depth_00000.png",
         lambda path: any(Path(path).glob("frame_*.json")) and any(Path(path).glob("depth_*.png")),
         open_3d_scanner_app, sensor="lidar-iphone",
+    ),
+    SourceFormat(
+        "ARKitScenes", "lowres_wide/ and lowres_depth/",
+        lambda path: (_video(path) / "lowres_wide").is_dir() and (_video(path) / "lowres_depth").is_dir(),
+        open_arkitscenes, sensor="lidar-iphone",
     ),
 )  # fmt: skip

@@ -80,7 +80,7 @@ def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     if depth_folder is None and (problem := without_depth(folder)):
         raise problem
     colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    images, skipped, origins = pairs_by_names(folder, colors, list_images(depth_folder, DEPTH_ENDINGS), settings)
+    images, skipped, origins = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS), settings)
     truth = read_groundtruth(folder)
     return folder_source(folder, settings, images, None, MM_PER_METRE, truth, skipped, origins=origins)
 
@@ -89,7 +89,7 @@ Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
 """Pairs of images, why others are left out, and the origins of times and pairs."""
 
 
-def pairs_by_names(folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig) -> Found:
+def _pairs(folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig) -> Found:
     """Pair images by the times in their names, else by name, by number, or by order if names do no more than count."""
     (color_s, read), (depth_s, depth_read) = times_of_names(colors), times_of_names(depths)
     timed = [read.origin, depth_read.origin].count(NAMED)
@@ -149,7 +149,7 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
         images, skipped, origins = _timed_pairs(folder, colors, depths, settings, *stamps)
         images = [replace(i, timestamp_s=i.timestamp_s + i.depth_late_s) for i in images]  # poses are those of depth
     elif NAMED in (times_of_names(colors)[1].origin, times_of_names(depths)[1].origin):
-        images, skipped, origins = pairs_by_names(folder, colors, depths, settings)
+        images, skipped, origins = _pairs(folder, colors, depths, settings)
     else:
         names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
         numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)

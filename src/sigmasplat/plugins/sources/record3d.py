@@ -1,7 +1,7 @@
 """Read iPhone recordings of the app Record3D: .r3d files, and folders of its export "EXR + RGB".
 
-.r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes; also if
-               it was unpacked and packed again, with its folder, or lies alone in a folder
+.r3d is a zip: metadata (JSON)   rgbd/0.jpg   rgbd/0.depth, rgbd/0.conf: LZFSE of float32 metres and of bytes;
+               also packed again with its folder, or alone in a folder
 the export:    metadata.json     rgb/0.jpg    depth/0.exr
 
 metadata: w, h, dw, dh (sizes in pixels), K (3×3 by columns), fps, frameTimestamps (seconds), perFrameIntrinsicCoeffs
@@ -53,8 +53,7 @@ MOST_MEMBER_BYTES = 128 << 20
 
 
 class Archive:
-    """The files of a zip archive or of its unpacked folder, by name relative to the metadata; nothing is unpacked to
-    disk."""
+    """The files of a zip archive or of its unpacked folder, by name beside the metadata; none are unpacked."""
 
     def __init__(self, path: Path) -> None:
         """List the files. Raises SourceError if a file is not a complete zip archive."""
@@ -220,12 +219,10 @@ def _packed(place: Path) -> Path:
 
 def _recognises(path: str) -> bool:
     place = _packed(Path(path))
-    if place.suffix.lower() == ".r3d" and place.is_file():
-        return True
     if place.is_file():
         with suppress(*DAMAGED), zipfile.ZipFile(place) as archive:
-            return any("rgbd/" in name for name in archive.namelist())
-        return False
+            return place.suffix.lower() == ".r3d" or any("rgbd/" in name for name in archive.namelist())
+        return place.suffix.lower() == ".r3d"
     return any((place / "rgbd").glob("*.depth")) or (
         (place / "metadata.json").is_file() and any((place / "depth").glob("*.exr"))
     )
