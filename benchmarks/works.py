@@ -97,7 +97,7 @@ class Works:
         maps, ids, weights = self.maps, self.ids, self.weights
         self.raster.view_forward(
             self.numbers, self.params, None, 7, RENDER.alpha_min, RENDER.transmittance_stop, RENDER.depth == "ray",
-            0.0, self.reference, maps[:7], maps[7], maps[8], ids[0], weights[0], ids[1], weights[1],
+            self.reference, maps[:7], maps[7], maps[8], ids[0], weights[0], ids[1], weights[1],
             None, np.zeros(3),
         )  # fmt: skip
 

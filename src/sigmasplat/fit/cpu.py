@@ -181,7 +181,7 @@ class CompiledViewDependentStep(ViewDependentStep):
 
     def _harmonics(self, field: GaussianField, rate: float) -> _core.Harmonics:
         h = field.get_or_create("harmonics")
-        return _core.Harmonics(h.params, h.moment1, h.moment2, h.last_step, self.degree, h.steps, rate, True)
+        return _core.Harmonics(h.params, h.moment1, h.moment2, h.last_step, self.degree, h.steps, rate)
 
 
 # ---- tracking ----

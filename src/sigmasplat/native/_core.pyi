@@ -75,7 +75,6 @@ def mapping_losses(
     g_moment: Array | None,
     g_alpha: Array | None,
     losses: Array,
-    depth_weight: Array | None = None,
 ) -> None: ...
 def tracking_loss(
     sums: Array,
@@ -206,7 +205,6 @@ class Harmonics:
         degree: int,
         step: int,
         rate: float,
-        camera_moves_colors: bool,
     ) -> None: ...
 
 class Rasteriser:
@@ -255,7 +253,6 @@ class Rasteriser:
         alpha_min: float,
         stop: float,
         ray_depth: bool,
-        depth_gate_m: float,
         reference: Array | None,
         sums: Array,
         moment: Array | None,

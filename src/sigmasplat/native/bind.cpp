@@ -91,17 +91,15 @@ struct Harmonics {
     Ints last_step;
     int degree, step;
     float rate;
-    bool camera_moves_colors;
 
-    Harmonics(Floats p, Floats m1, Floats m2, Ints last, int degree_used, int number, float learning_rate, bool camera_moves)
-        : params(p), moment1(m1), moment2(m2), last_step(last), degree(degree_used), step(number), rate(learning_rate),
-          camera_moves_colors(camera_moves) {
+    Harmonics(Floats p, Floats m1, Floats m2, Ints last, int degree_used, int number, float learning_rate)
+        : params(p), moment1(m1), moment2(m2), last_step(last), degree(degree_used), step(number), rate(learning_rate) {
         need(p.ndim() == 2 && p.shape(1) == 45 && degree >= 1 && degree <= 3, "harmonics are [N, 45], of degree 1 to 3");
         need(last.size() == p.shape(0) && m1.size() == p.size() && m2.size() == p.size(), "Adam's state must fit the rows");
     }
     ViewColors colors() const { return {params.data(), degree}; }
     HarmonicsStep stepped() const {
-        return {params.data(), {moment1.data(), moment2.data(), last_step.data()}, degree, step, rate, camera_moves_colors};
+        return {params.data(), {moment1.data(), moment2.data(), last_step.data()}, degree, step, rate};
     }
 };
 static void need_rows(const Harmonics* h, size_t n) { need(!h || h->params.shape(0) == n, "harmonics must fit the rows"); }
@@ -143,20 +141,19 @@ public:
         nb::gil_scoped_release unlocked;
         kernels->gather(context, planes.data(), int(sums.shape(1)), sums.data());
     }
-    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, float depth_gate_m, Maybe<ConstFloats> reference,
+    void view_forward(ConstFloats view, ConstFloats params, const Harmonics* harmonics, int k, float alpha_min, float stop, bool ray_depth, Maybe<ConstFloats> reference,
                       Floats sums, Maybe<Floats> moment, Floats alpha, Maybe<Ints> median_id, Maybe<Floats> median_weight,
                       Maybe<Ints> dominant_id, Maybe<Floats> dominant_weight, Maybe<Floats> median_depth, Doubles seconds) {
         Outputs o = outputs(sums, moment, alpha, median_id, median_weight, dominant_id, dominant_weight);
         o.median_depth = pointer(median_depth);
         need(params.ndim() == 2 && params.shape(1) == 17, "params must be [N, 17]");
-        need(depth_gate_m >= 0.f, "depth_gate_m must not be negative");
         need(k == 4 || k == 7, "a view has 4 features (colour, depth) or 7 (and variance)");
         need(!o.moment == !reference, "a moment needs a reference depth");
         need(seconds.size() >= 3, "seconds needs 3 places");
         need_rows(harmonics, params.shape(0));
         nb::gil_scoped_release unlocked;
         kernels->view_forward(context, view.data(), params.data(), harmonics ? harmonics->colors() : ViewColors{}, int64_t(params.shape(0)), k, pointer(reference),
-                              {alpha_min, stop, ray_depth, depth_gate_m}, o, seconds.data());
+                              {alpha_min, stop, ray_depth}, o, seconds.data());
     }
     void view_backward(ConstFloats params, ConstFloats g_sums, Maybe<ConstFloats> g_moment, Maybe<ConstFloats> g_alpha, Maybe<Ints> median_id, Maybe<ConstFloats> g_median_depth,
                        Floats g_params, Maybe<Floats> pull, Doubles g_twist, Doubles seconds) {
@@ -268,18 +265,18 @@ NB_MODULE(_core, m) {
     }, nb::arg("image"), nb::arg("target"), nb::arg("cache"), nb::arg("width"), nb::arg("height"), nb::arg("mask").none(), nb::arg("weight"), nb::arg("gradient"));
     m.def("mapping_losses", [](ConstFloats sums, Maybe<ConstFloats> median_depth, Maybe<ConstFloats> moment, Maybe<ConstFloats> alpha,
                                ConstFloats target_color, ConstFloats target_depth, int height, std::vector<float> weights, double valid_pixels, Floats g_sums,
-                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses, Maybe<ConstFloats> depth_weight) {
+                               Maybe<Floats> g_median_depth, Maybe<Floats> g_moment, Maybe<Floats> g_alpha, Doubles losses) {
         need(weights.size() == LOSS_TERMS && losses.size() == LOSS_TERMS, "mapping_losses: seven weights, seven losses");
         need(!median_depth == !g_median_depth && !moment == !g_moment && !alpha == !g_alpha, "a gradient goes with its plane");
         const size_t stride = sums.shape(2), plane = sums.shape(1) * stride;
         const LossWeights w{weights[0], weights[1], weights[2], weights[3], weights[4], weights[5], weights[6]};
         nb::gil_scoped_release unlocked;
         active->mapping_losses(sums.data(), target_color.data(), target_depth.data(), height, stride, plane, sums.shape(0) >= 7,
-                               {pointer(median_depth), pointer(moment), pointer(alpha), pointer(depth_weight)}, w, valid_pixels,
+                               {pointer(median_depth), pointer(moment), pointer(alpha)}, w, valid_pixels,
                                g_sums.data(), {pointer(g_median_depth), pointer(g_moment), pointer(g_alpha)}, losses.data());
     }, nb::arg("sums"), nb::arg("median_depth").none(), nb::arg("moment").none(), nb::arg("alpha").none(), nb::arg("target_color"), nb::arg("target_depth"),
        nb::arg("height"), nb::arg("weights"), nb::arg("valid_pixels"), nb::arg("g_sums"), nb::arg("g_median_depth").none(), nb::arg("g_moment").none(),
-       nb::arg("g_alpha").none(), nb::arg("losses"), nb::arg("depth_weight").none() = nb::none());
+       nb::arg("g_alpha").none(), nb::arg("losses"));
     m.def("tracking_loss", [](ConstFloats sums, ConstFloats alpha, ConstFloats target_color, ConstFloats target_depth, int width, int height,
                               std::vector<float> options, bool uncertainty, bool kept, float gain, float offset, Floats g_sums, Doubles g_exposure) {
         need(g_exposure.size() == 2, "g_exposure has 2 numbers");
@@ -331,8 +328,8 @@ NB_MODULE(_core, m) {
     });
     bind_images(m);
     nb::class_<Harmonics>(m, "Harmonics")
-        .def(nb::init<Floats, Floats, Floats, Ints, int, int, float, bool>(), nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"),
-             nb::arg("last_step"), nb::arg("degree"), nb::arg("step"), nb::arg("rate"), nb::arg("camera_moves_colors"));
+        .def(nb::init<Floats, Floats, Floats, Ints, int, int, float>(), nb::arg("params"), nb::arg("moment1"), nb::arg("moment2"),
+             nb::arg("last_step"), nb::arg("degree"), nb::arg("step"), nb::arg("rate"));
     nb::class_<Rasteriser>(m, "Rasteriser")
         .def(nb::init<>())
         .def_prop_ro("bytes", &Rasteriser::bytes)
@@ -342,7 +339,7 @@ NB_MODULE(_core, m) {
         .def("blend_backward", &Rasteriser::blend_backward, nb::arg("g_sums"), nb::arg("g_moment").none(),
              nb::arg("g_alpha").none(), nb::arg("g_means2d"), nb::arg("g_conics"), nb::arg("g_z"), nb::arg("g_opacities"), nb::arg("g_features"))
         .def("gather", &Rasteriser::gather, nb::arg("planes"), nb::arg("sums"))
-        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"), nb::arg("depth_gate_m"),
+        .def("view_forward", &Rasteriser::view_forward, nb::arg("view"), nb::arg("params"), nb::arg("harmonics").none(), nb::arg("k"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("ray_depth"),
              nb::arg("reference").none(), nb::arg("sums"), nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(),
              nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none(), nb::arg("median_depth").none(), nb::arg("seconds"))
         .def("view_backward", &Rasteriser::view_backward, nb::arg("params"), nb::arg("g_sums"),

@@ -14,9 +14,7 @@ struct PadSize { int tile_width, tile_height, lanes; };
 
 struct BlendOptions {
     float alpha_min, transmittance_stop;
-    bool ray_depth = false;                // views only, like the gate
-    float depth_gate_m = 0.f;              // scale s of the median gate; 0: no gate
-    bool slopes() const { return ray_depth || depth_gate_m > 0.f; }   // whether rows hold slopes; with a gate they may be 0
+    bool ray_depth = false;                // views only; rows then hold slopes
 };
 
 struct Outputs {                           // planes of Hp × Wp, padded to whole tiles
@@ -38,7 +36,7 @@ struct SplatGradients { float *means2d, *conics, *z, *opacities, *features; };
 
 constexpr int LOSS_TERMS = 7;
 struct LossWeights { float l1, depth, nll_color, nll_depth, median_depth, moment, mean_depth; };
-struct DepthMaps { const float *median_depth, *moment, *alpha, *weight; };   // null where their weight is 0; weight: of each reading, or null
+struct DepthMaps { const float *median_depth, *moment, *alpha; };   // null where their weight is 0
 struct DepthGradients { float *median_depth, *moment, *alpha; };
 
 struct AdamOptions { const float* rates; float beta1, beta2, epsilon; int step; };   // rates: one per column
@@ -49,7 +47,6 @@ struct ViewColors { const float* harmonics; int degree; };   // harmonics [n, 45
 struct HarmonicsStep {                     // Adam's step of the harmonics, with one learning rate
     float* params; AdamState state;
     int degree, step; float rate;
-    bool camera_moves_colors;              // whether the pose gradient includes the path through the colours
 };
 
 struct Plane { int width, height; size_t stride, plane; };   // distance in floats of rows, and of image planes

@@ -22,9 +22,8 @@ static void mapping_losses(const float* sums, const float* target_color, const f
             const vf depth = load(target_depth + at), zero = splat(0.f);
             const Mask valid = gt(depth, zero);
             const vf depth_error = only(valid, load(sums + 3 * plane + at) - depth);
-            const vf sure = maps.weight ? load(maps.weight + at) : splat(1.f);   // of the reading, 1 on average
-            total[1] += sure * abs(depth_error);
-            vf g_depth = sure * signed_weight(depth_error, weights.depth * per_pixel);
+            total[1] += abs(depth_error);
+            vf g_depth = signed_weight(depth_error, weights.depth * per_pixel);
             if (maps.median_depth) {                  // both depths get a gradient; median depth 0 = none
                 const vf median = load(maps.median_depth + at);
                 const vf apart = only(both(valid, gt(median, zero)), load(sums + 3 * plane + at) - median);
@@ -35,14 +34,14 @@ static void mapping_losses(const float* sums, const float* target_color, const f
             }
             if (maps.moment) {
                 const vf U = only(valid, load(maps.moment + at));
-                total[5] += sure * abs(U);
-                store(gradients.moment + at, sure * signed_weight(U, weights.moment * per_pixel));
+                total[5] += abs(U);
+                store(gradients.moment + at, signed_weight(U, weights.moment * per_pixel));
             }
             if (maps.alpha) {                         // D̂/A; no gradient where A is small
                 const vf A = load(maps.alpha + at), half = splat(0.5f), inv = 1.f / max(A, half), mean = load(sums + 3 * plane + at) * inv;
                 const vf off = only(both(valid, gt(A, half)), mean - depth);
-                const vf g = sure * signed_weight(off, weights.mean_depth * per_pixel) * inv;
-                total[6] += sure * abs(off);
+                const vf g = signed_weight(off, weights.mean_depth * per_pixel) * inv;
+                total[6] += abs(off);
                 g_depth += g;
                 store(gradients.alpha + at, zero - g * mean);
             }

@@ -29,15 +29,15 @@ struct AlphaBuffer {                                  // one chunk of a block's 
     int entry[ALPHA_CHUNK + 4];
 };
 struct Walk {                                         // all splats of a block that pass it, near to far: for the backward pass
-    Buffer<Pixels> alpha, weight, gain, depth_weight;   // depth_weight: with the median gate, w·∂(gated depth)/∂depth
+    Buffer<Pixels> alpha, weight, gain;
     Buffer<int> entry;
     alignas(64) float pairs[ALPHA_CHUNK][2 * W];
     void reserve(size_t n) { alpha.reserve(n); weight.reserve(n); gain.reserve(n); entry.reserve(n); }
-    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + depth_weight.bytes() + entry.bytes(); }
+    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
 struct Scratch {                                      // buffers of one thread for its tile
-    Buffer<float> rows, records, depth_sums;          // depth_sums: with the median gate, W floats a splat
+    Buffer<float> rows, records;
     Buffer<Center> centers;                           // relative to the tile's centre
     Buffer<BlockMask> masks;
     Buffer<int> lists;
@@ -47,14 +47,14 @@ struct Scratch {                                      // buffers of one thread f
     int counts[BLOCKS];
     size_t list_capacity = 0;
     size_t bytes() const {
-        return rows.bytes() + records.bytes() + depth_sums.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
+        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
                + sizeof(*this);
     }
 };
 
 
-// With depth along the ray or the median gate (options.slopes()) a row of at most eight features holds a splat's slopes
-// in two of their places: the depth itself is in the geometry. Depths of centres have slopes 0.
+// With depth along the ray a row of at most eight features holds a splat's slopes in two of their places: the depth
+// itself is in the geometry.
 constexpr int SLOPE_U = 3, SLOPE_V = 7;
 
 // The compiled feature counts; other counts are padded with zeros.
@@ -82,7 +82,7 @@ struct Render {                                       // what a forward pass sto
     Buffer<Box> boxes;
     Buffer<int> tiles_of, tile_begin, histogram, chunk_begin;   // chunk_begin: first slot of each chunk
     Buffer<uint64_t> items;
-    Buffer<float> median_gradient;                    // with slopes three numbers a splat, else one
+    Buffer<float> median_gradient;                    // with depth along the ray three numbers a splat, else one
     Scratch* scratch = nullptr;
     int threads = 0;
 

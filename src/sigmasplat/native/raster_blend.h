@@ -140,21 +140,9 @@ template <int ROW_FLOATS> SIGMA_INLINE int live_alphas(const float* rows, const 
     return n;
 }
 
-// The median gate moves depths behind the median depth towards it: δ = depth − median > 0 becomes β·δ, β = exp(−(δ/s)²).
-// `depth` is the gated depth, `slope` its derivative by depth, with the median held fixed.
-struct GatedDepth { vf depth, slope; };
-SIGMA_INLINE GatedDepth gate_depth(vf depth, vf median, Mask after_median, vf inverse_s) {
-    const vf off = depth - median, q = off * inverse_s, square = min(q * q, splat(60.f));   // 60: in the range of exp2_alpha
-    const vf beta = exp2_alpha(square * -LOG2_E);
-    const Mask gated = both(after_median, gt(off, splat(0.f)));
-    return {select(gated, fma(beta, off, median), depth), select(gated, beta * fnma(square, splat(2.f), splat(1.f)), splat(1.f))};
-}
-
-// SLOPES: a splat's depth at a pixel is linear in the pixel. GATE: the depth that is summed is gated; needs SLOPES.
-template <int K, bool MOMENT, bool IDS, bool SLOPES, bool GATE> static void blend_tiles(Render& r, Outputs o) {
-    static_assert(SLOPES || !GATE);
+// SLOPES: a splat's depth at a pixel is linear in the pixel.
+template <int K, bool MOMENT, bool IDS, bool SLOPES> static void blend_tiles(Render& r, Outputs o) {
     constexpr int ROW_FLOATS = row_floats<K>;
-    const vf inverse_s = splat(GATE ? 1.f / r.options.depth_gate_m : 0.f);
     const size_t plane = r.plane(), stride = r.padded_width();
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
     const vf stop = splat(r.options.transmittance_stop), half = splat(0.5f), zero = splat(0.f), one = splat(1.f);
@@ -192,11 +180,7 @@ template <int K, bool MOMENT, bool IDS, bool SLOPES, bool GATE> static void blen
                         if constexpr (SLOPES) {
                             depth = fma(splat(f[SLOPE_V]), y, fma(splat(f[SLOPE_U]), x, splat(geometry.z)));
                             for (int c = 0; c < 3; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
-                            if constexpr (GATE) {
-                                sum[3] = fma(w, gate_depth(depth, median_z, mask_not(before_half), inverse_s).depth, sum[3]);
-                            } else {
-                                sum[3] = fma(w, depth, sum[3]);
-                            }
+                            sum[3] = fma(w, depth, sum[3]);
                             for (int c = 4; c < K; c++) sum[c] = fma(w, splat(f[c]), sum[c]);
                             if (MOMENT) { const vf d = depth - ref; moment = fma(w * d, d, moment); }
                         } else {
@@ -211,8 +195,6 @@ template <int K, bool MOMENT, bool IDS, bool SLOPES, bool GATE> static void blen
                             median = select(crossing, id, median);
                             median_w = select(crossing, w, median_w);
                             median_z = select(crossing, SLOPES ? depth : splat(geometry.z), median_z);
-                        } else if (GATE) {
-                            median_z = select(both(before_half, gt(w, zero)), depth, median_z);
                         }
                     }
                     if (!any(ge(T, stop))) break;

@@ -81,27 +81,13 @@ SIGMA_INLINE void store_basis(const PixelGradients<K>& on_pixels, vf x, vf y, Ba
     }
 }
 
-// The factors of each pixel's depth weight with the median gate: ∂L/∂(depth sum)·{1, x, y}, one row per pixel.
-using GateBasis = float[W][W];
-SIGMA_INLINE void store_gate_basis(vf on_depth, vf x, vf y, GateBasis& basis) {
-    vf columns[W];
-    for (auto& c : columns) c = splat(0.f);
-    columns[0] = on_depth;
-    columns[1] = on_depth * x;
-    columns[2] = on_depth * y;
-    transpose(columns);
-    for (int m = 0; m < W; m++) store(basis[m], columns[m]);
-}
-
-// Near to far: store alpha, weight w and gain G = ∂L/∂w of each splat that reaches a live pixel, and with GATE its depth
-// weight. The median depth is found as in the forward pass; it is a constant. Returns the number of these splats.
-template <int ROW_FLOATS, int K, bool MOMENT, bool SLOPES, bool GATE>
+// Near to far: store alpha, weight w and gain G = ∂L/∂w of each splat that reaches a live pixel. Returns their number.
+template <int ROW_FLOATS, int K, bool MOMENT, bool SLOPES>
 SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, vf y, const PixelGradients<K>& on_pixels,
-                          float log_alpha_min, vf stop, float gate_m, Walk& walk) {
+                          float log_alpha_min, vf stop, Walk& walk) {
     Pixels *const alphas = walk.alpha.data, *const weights = walk.weight.data, *const gains = walk.gain.data;
     int* const entries = walk.entry.data;
-    const vf inverse_s = splat(GATE ? 1.f / gate_m : 0.f), half = splat(0.5f);
-    vf T = splat(1.f), median_z = splat(0.f);
+    vf T = splat(1.f);
     int n = 0;
     for (int j = 0; j < count && any(ge(T, stop)); j += ALPHA_CHUNK) {
         const int end = count < j + ALPHA_CHUNK ? count : j + ALPHA_CHUNK, begin = n;
@@ -117,15 +103,7 @@ SIGMA_INLINE int walk_out(const float* rows, const int* list, int count, vf x, v
                 depth = fma(splat(row[GEOMETRY + SLOPE_V]), y, fma(splat(row[GEOMETRY + SLOPE_U]), x, depth));
                 for (int c = 0; c < K; c++)
                     if (c != 3) gain = fma(on_pixels.sums[c], splat(row[GEOMETRY + c]), gain);
-                if constexpr (GATE) {
-                    const Mask before_half = ge(T, half);
-                    const GatedDepth gated = gate_depth(depth, median_z, mask_not(before_half), inverse_s);
-                    median_z = select(both(before_half, gt(w, splat(0.f))), depth, median_z);
-                    store(walk.depth_weight.data[e], w * gated.slope);
-                    gain = fma(on_pixels.sums[3], gated.depth, gain);
-                } else {
-                    gain = fma(on_pixels.sums[3], depth, gain);
-                }
+                gain = fma(on_pixels.sums[3], depth, gain);
                 if (MOMENT) {
                     const vf d = depth - on_pixels.ref;
                     gain = fma(on_pixels.moment * d, d, gain);
@@ -175,14 +153,6 @@ SIGMA_INLINE void add_to_record(const float* pairs, const Basis<K, MOMENT, SLOPE
     for (int h = 0; h < EXTRA / W; h++) store(record + 16 + h * W, rest[h]);
 }
 
-// Add one splat's depth weights over a block's pixels to its depth sums: weights times basis.
-SIGMA_INLINE void add_to_depth_sums(const float* depth_weights, const GateBasis& basis, float* sums) {
-    vf acc[2] = {load(sums), splat(0.f)};
-#pragma GCC unroll 16
-    for (int m = 0; m < W; m++) acc[m & 1] = fma(splat(depth_weights[m]), load(basis[m]), acc[m & 1]);
-    store(sums, acc[0] + acc[1]);
-}
-
 // Far to near. C is the gain of one unit of light from behind a splat: ∂L/∂α = T·(G − C), then C ← (1 − α)·C + α·G. C
 // is not computed as a difference of sums over all splats: where T is small, opaque splats in front would leave only
 // rounding errors in it.
@@ -212,7 +182,7 @@ SIGMA_INLINE void walk_back(int n, const Basis<K, MOMENT, SLOPES>& basis, Walk& 
 
 // Process every tile's pixels again and pass its records to `finish(scratch, tile)`. The first K of a row's ROW_K
 // features have gradients; the others are skipped.
-template <int ROW_K, int K, bool MOMENT, bool SLOPES, bool GATE, class Finish>
+template <int ROW_K, int K, bool MOMENT, bool SLOPES, class Finish>
 static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
     constexpr int RECORD = record_floats<K, MOMENT, SLOPES>;
     const float log_alpha_min = __builtin_log2f(r.options.alpha_min);
@@ -221,35 +191,20 @@ static void blend_tiles_backward(Render& r, OutputGradients g, Finish finish) {
     {
         Scratch& s = r.scratch[omp_get_thread_num()];
         alignas(64) Basis<K, MOMENT, SLOPES> basis;
-        alignas(64) GateBasis gate_basis;
 #pragma omp for schedule(dynamic, 1)
         for (int index = 0; index < r.tiles_x * r.tiles_y; index++) {
             const Tile tile = gather_tile<row_floats<ROW_K>, true, SLOPES>(r, s, index);
             memset(s.records.reserve(size_t(tile.count + W) * RECORD), 0, size_t(tile.count + W) * RECORD * sizeof(float));
             s.walk.reserve(tile.count + 4);
-            if constexpr (GATE) {
-                memset(s.depth_sums.reserve(size_t(tile.count + 1) * W), 0, size_t(tile.count + 1) * W * sizeof(float));
-                s.walk.depth_weight.reserve(tile.count + 4);
-            }
             for (int b = 0; b < BLOCKS; b++) {
                 if (!s.counts[b]) continue;
                 const vf x = block_x(b), y = block_y(b);
                 const PixelGradients<K> on_pixels = gradients_at<K, MOMENT>(r, g, block_at(tile, b, r.padded_width()));
                 store_basis<K, MOMENT, SLOPES>(on_pixels, x, y, basis);
-                const int n = walk_out<row_floats<ROW_K>, K, MOMENT, SLOPES, GATE>(
-                    s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y, on_pixels, log_alpha_min, stop,
-                    r.options.depth_gate_m, s.walk);
+                const int n = walk_out<row_floats<ROW_K>, K, MOMENT, SLOPES>(
+                    s.rows.data, &s.lists[b * s.list_capacity], s.counts[b], x, y, on_pixels, log_alpha_min, stop, s.walk);
                 walk_back<K, MOMENT, SLOPES>(n, basis, s.walk, s.records.data);
-                if constexpr (GATE) {
-                    store_gate_basis(on_pixels.sums[3], x, y, gate_basis);
-                    for (int e = 0; e < n; e++)
-                        add_to_depth_sums(s.walk.depth_weight.data[e], gate_basis, &s.depth_sums[size_t(s.walk.entry.data[e]) * W]);
-                }
             }
-            if constexpr (GATE)                       // the records' own sums of depth have no gate
-                for (int k = 0; k < tile.count; k++)
-                    for (int q = 0; q < 3; q++)
-                        s.records[size_t(k) * RECORD + weight_place<is_packed<K, MOMENT, SLOPES>>(q ? K + q - 1 : 3)] = s.depth_sums[size_t(k) * W + q];
             finish(s, tile);
         }
         fence();                                      // records may have been written past the caches

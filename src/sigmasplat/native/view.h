@@ -1,38 +1,33 @@
 // Stages 1–3 together: the two operators `project` and `blend`, and the fused path from raw parameter rows to images
 // and back.
 
-// Call f(slopes, gate): which depth of views is compiled in.
-template <class F> SIGMA_INLINE void with_depth(const BlendOptions& o, F f) {
-    if (o.depth_gate_m > 0.f) f(std_int<1>{}, std_int<1>{});
-    else o.ray_depth ? f(std_int<1>{}, std_int<0>{}) : f(std_int<0>{}, std_int<0>{});
-}
+// Call f(slopes): which depth of views is compiled in.
+template <class F> SIGMA_INLINE void with_depth(const BlendOptions& o, F f) { o.ray_depth ? f(std_int<1>{}) : f(std_int<0>{}); }
 
 static void blend(Render& r, Outputs o) {
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
-        const auto maps = [&](auto slopes, auto gate) {
-            constexpr bool SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
-            if (o.moment) o.dominant_id ? blend_tiles<K, true, true, SLOPES, GATE>(r, o) : blend_tiles<K, true, false, SLOPES, GATE>(r, o);
-            else o.dominant_id ? blend_tiles<K, false, true, SLOPES, GATE>(r, o) : blend_tiles<K, false, false, SLOPES, GATE>(r, o);
+        const auto maps = [&](auto slopes) {
+            constexpr bool SLOPES = decltype(slopes)::value != 0;
+            if (o.moment) o.dominant_id ? blend_tiles<K, true, true, SLOPES>(r, o) : blend_tiles<K, true, false, SLOPES>(r, o);
+            else o.dominant_id ? blend_tiles<K, false, true, SLOPES>(r, o) : blend_tiles<K, false, false, SLOPES>(r, o);
         };
         if constexpr (K <= 7) with_depth(r.options, maps);
-        else maps(std_int<0>{}, std_int<0>{});
+        else maps(std_int<0>{});
     });
 }
 static void blend_gradients(Render& r, OutputGradients g) {   // to each splat's slots
     with_features(r.k, [&](auto k) {
         constexpr int K = decltype(k)::value;
-        const auto to_slots = [&](auto moment, auto slopes, auto gate) {
-            constexpr bool MOMENT = decltype(moment)::value != 0, SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
+        const auto to_slots = [&](auto moment, auto slopes) {
+            constexpr bool MOMENT = decltype(moment)::value != 0, SLOPES = decltype(slopes)::value != 0;
             r.partials.reserve(size_t(r.intersections + 1) * record_floats<K, MOMENT, SLOPES>);
-            blend_tiles_backward<K, K, MOMENT, SLOPES, GATE>(
+            blend_tiles_backward<K, K, MOMENT, SLOPES>(
                 r, g, [&](Scratch& s, const Tile& tile) { flush_records<K, MOMENT, SLOPES>(r, s, tile); });
         };
-        const auto any_moment = [&](auto slopes, auto gate) {
-            g.moment ? to_slots(std_int<1>{}, slopes, gate) : to_slots(std_int<0>{}, slopes, gate);
-        };
+        const auto any_moment = [&](auto slopes) { g.moment ? to_slots(std_int<1>{}, slopes) : to_slots(std_int<0>{}, slopes); };
         if constexpr (K <= 7) with_depth(r.options, any_moment);
-        else any_moment(std_int<0>{}, std_int<0>{});
+        else any_moment(std_int<0>{});
     });
 }
 
@@ -122,15 +117,6 @@ static void blend_backward(Context* context, OutputGradients g, SplatGradients o
 
 // ---- fused: rows of raw parameters to images and back ----------------------------------------------------------------
 
-// Depths of centres with the median gate have slopes 0, which are constants.
-SIGMA_INLINE void set_slopes(const Render& r, const Shape<vf>& s, Footprint<vf>& p) {
-    if (r.options.ray_depth) add_slopes_to(r.view, s, p);
-    else p.slope_u = p.slope_v = splat(0.f);
-}
-SIGMA_INLINE void drop_slopes(const BlendOptions& o, FootprintGradient<vf>& g) {
-    if (!o.ray_depth) g.slope_u = g.slope_v = splat(0.f);
-}
-
 struct Splats { Shape<vf> shape; vf opacity, color[3], variance[3]; };
 
 template <bool VARIANCE> SIGMA_INLINE Splats activate(const float (*row)[W]) {   // GaussianField's columns, activated
@@ -155,7 +141,7 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
             for (int l = 0; l <= W; l++) __builtin_prefetch(params + (i + 2 * W + l) * ROW);
             Splats s = activate<(K > 4)>(row);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            set_slopes(r, s.shape, p);
+            if (r.options.ray_depth) add_slopes_to(r.view, s.shape, p);
             const auto fill = [&](unsigned live) {
                 if (colors.degree) {
                     alignas(64) float harmonics[HARMONICS][W];
@@ -163,9 +149,9 @@ template <int K> static void pack_view(Render& r, const float* params, const Vie
                     show_colors(r.view, colors, i, live, s.shape.mean, s.color, harmonics);
                 }
                 for (int q = 0; q < 3; q++) store(f[q], s.color[q]);
-                store(f[3], r.options.slopes() ? p.slope_u : p.z);
+                store(f[3], r.options.ray_depth ? p.slope_u : p.z);
                 for (int q = 0; q < 3; q++) store(f[4 + q], K > 4 ? fma(s.color[q], s.color[q], s.variance[q]) : splat(0.f));
-                store(f[7], r.options.slopes() ? p.slope_v : splat(0.f));
+                store(f[7], r.options.ray_depth ? p.slope_v : splat(0.f));
             };
             total += pack<row_floats<K>>(r, p, s.opacity, gt(p.z, splat(r.view.near_m)), i, total, f, fill);
         }
@@ -192,7 +178,7 @@ static void view_forward(Context* context, const float* view_numbers, const floa
 // the pixels, so that sums do not depend on threads.
 static const float* gather_median(Render& r, OutputGradients g) {
     if (!g.median_depth) return nullptr;
-    const size_t splats = size_t(r.n) + W, numbers = (r.options.slopes() ? 3 : 1) * splats;
+    const size_t splats = size_t(r.n) + W, numbers = (r.options.ray_depth ? 3 : 1) * splats;
     float* sums = r.median_gradient.reserve(numbers);
     memset(sums, 0, numbers * sizeof(float));
     const size_t stride = r.padded_width();
@@ -202,7 +188,7 @@ static const float* gather_median(Render& r, OutputGradients g) {
             const int id = g.median_id[at];
             if (id < 0) continue;
             sums[id] += g.median_depth[at];
-            if (!r.options.slopes()) continue;
+            if (!r.options.ray_depth) continue;
             const Geometry& splat = r.geometry(id);
             sums[splats + id] += g.median_depth[at] * (float(x) - splat.u);
             sums[2 * splats + id] += g.median_depth[at] * (float(y) - splat.v);
@@ -239,7 +225,7 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
             Splats s = activate<(K > 4)>(row);
             if (colors.degree) show_colors(r.view, colors, i, seen_bits, s.shape.mean, s.color, harmonics);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            if constexpr (SLOPES) set_slopes(r, s.shape, p);
+            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> g = footprint_gradient(moments_of<PACKED>(sums), p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 add_depth_gradient<K, MOMENT>(sums, p, g);
@@ -251,7 +237,6 @@ static void chain_to_params(const Render& r, const float* params, const ViewColo
                     g.u = fnma(p.slope_u, on_depth, g.u);
                     g.v = fnma(p.slope_v, on_depth, g.v);
                 }
-                drop_slopes(r.options, g);
             } else {
                 g.z = weight_sum<PACKED>(sums, 3);
                 if constexpr (MOMENT) g.z += fma(p.z, weight_sum<PACKED>(sums, K), weight_sum<PACKED>(sums, K + 1));
@@ -295,8 +280,7 @@ static void chain_any(Render& r, const float* params, const ViewColors& colors, 
         g.moment ? chain_to_params<K, true, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen)
                  : chain_to_params<K, false, SLOPES>(r, params, colors, g_median, pull, g_twist, sink, unseen);
     };
-    if (r.options.slopes()) r.k <= 4 ? chain(std_int<4>{}, std_int<1>{}) : chain(std_int<7>{}, std_int<1>{});
-    else r.k <= 4 ? chain(std_int<4>{}, std_int<0>{}) : chain(std_int<7>{}, std_int<0>{});
+    with_depth(r.options, [&](auto slopes) { r.k <= 4 ? chain(std_int<4>{}, slopes) : chain(std_int<7>{}, slopes); });
 }
 
 static void view_backward(Context* context, const float* params, OutputGradients g, float* g_params, float* pull,
@@ -349,7 +333,7 @@ static double view_step(Context* context, float* params, OutputGradients g, Adam
         [](int64_t) {});
     double sum = 0;
     for (int64_t i = 0; i * W < r.n; i++) sum += cost[i];
-    if (harmonics.degree && harmonics.camera_moves_colors)   // a camera motion ρ acts like a splat motion −ρ
+    if (harmonics.degree)                             // a camera motion ρ acts like a splat motion −ρ
         for (int q = 0; q < 3; q++) {
             double on_mean = 0;
             for (int64_t i = 0; i * W < r.n; i++) on_mean += moved[i * 3 + q];
@@ -384,7 +368,7 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
             shift_moments(a.m[0], a.m[1], a.m[2], a.m[3], a.m[4], a.m[5], load(center[0]), load(center[1]));
             const Splats s = activate<false>(row);
             Footprint<vf> p = project(r.view, s.shape, splat(r.view.near_m));
-            if constexpr (SLOPES) set_slopes(r, s.shape, p);
+            if constexpr (SLOPES) add_slopes_to(r.view, s.shape, p);
             FootprintGradient<vf> f = footprint_gradient(a, p.l1, p.l2, p.l3);
             if constexpr (SLOPES) {
                 vf weighed[6];
@@ -392,7 +376,6 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
                 shift_depth_sums<4, false>([&](int c) -> vf& { return weighed[c]; }, load(center[0]), load(center[1]));
                 for (int c = 3; c < 6; c++) store(sums[weight_place(c)], weighed[c]);
                 add_depth_gradient<4, false>(sums, p, f);
-                drop_slopes(r.options, f);
             } else {
                 f.z = weight_sum(sums, 3);
             }
@@ -402,12 +385,11 @@ static void view_backward_pose(Context* context, const float* params, OutputGrad
         }
         for (int q = 0; q < 6; q++) partial[tile.index * 6 + q] = lane_sum(twist[q]);
     };
-    const auto walk = [&](auto slopes, auto gate) {
-        constexpr bool SLOPES = decltype(slopes)::value != 0, GATE = decltype(gate)::value != 0;
+    with_depth(r.options, [&](auto slopes) {
+        constexpr bool SLOPES = decltype(slopes)::value != 0;
         const auto each = [&](Scratch& scratch, const Tile& tile) { finish(slopes, scratch, tile); };
-        r.k <= 4 ? blend_tiles_backward<4, 4, false, SLOPES, GATE>(r, g, each) : blend_tiles_backward<7, 4, false, SLOPES, GATE>(r, g, each);
-    };
-    with_depth(r.options, walk);
+        r.k <= 4 ? blend_tiles_backward<4, 4, false, SLOPES>(r, g, each) : blend_tiles_backward<7, 4, false, SLOPES>(r, g, each);
+    });
     for (int q = 0; q < 6; q++) {
         g_twist[q] = 0;
         for (int t = 0; t < tiles; t++) g_twist[q] += partial[t * 6 + q];

@@ -170,7 +170,7 @@ class CpuView:
         self._made, self._splats = (depth_reference is not None, layers), len(params)
         view, planes = view_params(self.camera, T_camera_world, o), self.layers if layers else NO_LAYERS
         self.raster.view_forward(
-            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray", 0.0,
+            view, params, harmonics, self._k, o.alpha_min, o.transmittance_stop, o.depth == "ray",
             reference_depth, self.sums, moment, self.alpha, *planes, self.seconds[:3],
         )  # fmt: skip
 
