@@ -71,18 +71,18 @@ def _build(path: Path, features: int) -> None:
     flags = FLAGS + ["-mfma"] * (platform.machine() == "x86_64")
     includes = [f"-I{folder}" for folder in cubins.include_folders()]
     sources = [f"-DFEATURES={features}", *includes, str(HERE / "kernels.cpp"), "-o", str(path)]
-    made = subprocess.run([_compiler(), *flags, *sources], capture_output=True, text=True)
+    made = subprocess.run([compiler(), *flags, *sources], capture_output=True, text=True)
     assert made.returncode == 0, made.stderr
 
 
-def _compiler() -> str:
+def compiler() -> str:
     return os.environ.get("CXX") or "g++"
 
 
 def why_not() -> str | None:
     """Say why the emulation cannot be built here; None where it can."""
-    if shutil.which(_compiler()) is None:
-        return f"no C++ compiler to emulate CUDA with ({_compiler()}); set CXX"
+    if shutil.which(compiler()) is None:
+        return f"no C++ compiler to emulate CUDA with ({compiler()}); set CXX"
     if platform.system() != "Linux":
         return "CUDA is emulated on Linux only"
     return None

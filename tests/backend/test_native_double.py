@@ -5,15 +5,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from native_double import project_double
 from sigmasplat.data import se3
 from sigmasplat.render import reference
+from sigmasplat.render.kernels import view_params
 from splat_oracle import depths
 from splat_scenes import KINDS, Scene, scene, twist_gradient
-
-pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-
-from sigmasplat.native import _core
-from sigmasplat.render.kernels import view_params
 
 Array = NDArray[np.float64]
 PARTS = {"mean": slice(0, 3), "quat": slice(3, 7), "scale": slice(7, 10), "rho": slice(10, 13), "phi": slice(13, 16)}
@@ -30,10 +27,8 @@ def in_front(s: Scene) -> Scene:
 
 def native(s: Scene, T: Array, shape: Array, g: Array) -> tuple[Array, Array]:
     """Project rows of (mean, quat, scale) [N, 10]; return footprints (u, v, z, conic, slopes) and gradients [N, 16]."""
-    footprint, gradient = np.empty((len(shape), 8)), np.empty((len(shape), 16))
-    columns = [np.ascontiguousarray(shape[:, PARTS[name]]) for name in ("mean", "quat", "scale")]
-    _core.project_double(view_params(s.camera, T, s.options, np.float64), *columns, g, footprint, gradient)
-    return footprint, gradient
+    mean, quat, scale = (shape[:, PARTS[name]] for name in ("mean", "quat", "scale"))
+    return project_double(view_params(s.camera, T, s.options, np.float64), mean, quat, scale, g)
 
 
 def rows(s: Scene) -> Array:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from native_double import project_double
 from paper_settings import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField, Rows
@@ -15,7 +16,7 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.mapping_step import TorchStep, ViewDependentStep
 from sigmasplat.fit.target import Target
 from sigmasplat.render import Render, reference, render
-from sigmasplat.render.kernels import features_of
+from sigmasplat.render.kernels import features_of, view_params
 from splat_fields import exact_view, params_of, plane_gradients
 from splat_scenes import SMALL, Scene, assert_same_vector, probe, scene, twist_differences, twist_gradient
 
@@ -186,15 +187,9 @@ def turns_by_reference(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
 
 def turns_by_kernels(s: Scene, p: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
     """Do the same by the kernels' own arithmetic, compiled in double."""
-    pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
-    from sigmasplat.native import _core
-    from sigmasplat.render.kernels import view_params
-
     numbers = view_params(s.camera, s.T_camera_world.numpy(), s.options, np.float64)
-    footprint, out = np.empty((len(p), 8)), np.empty((len(p), 16))
     on_conics = np.concatenate([np.zeros((len(p), 3)), g.numpy(), np.zeros((len(p), 2))], 1)
-    shape = [np.ascontiguousarray(x.numpy()) for x in (s.means, s.quats, s.scales)]
-    _core.project_double(numbers, *shape, on_conics, footprint, out)
+    _, out = project_double(numbers, s.means.numpy(), s.quats.numpy(), s.scales.numpy(), on_conics)
     twist = torch.as_tensor(out[:, 10:])
     by_position = torch.linalg.cross(p, twist[:, :3])
     return twist[:, 3:] - by_position, by_position

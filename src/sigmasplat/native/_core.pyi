@@ -34,9 +34,6 @@ def project_backward(
     g_scales: Array,
     g_twist: Array,
 ) -> None: ...
-def project_double(
-    view: Array, means: Array, quats: Array, scales: Array, g: Array, footprint: Array, gradient: Array
-) -> None: ...
 def adam_settle(
     params: Array,
     moment1: Array,

@@ -1,6 +1,5 @@
 // Python bindings of the kernels: arrays in, arrays out, no copies, the GIL released; the instruction set is chosen at
 // run time.
-#include <cmath>
 #include <cstring>
 #include <memory>
 #include <string>
@@ -25,17 +24,6 @@ namespace avx512 { extern const Kernels table; }
 namespace avx2 { extern const Kernels table; }
 #endif
 namespace baseline { extern const Kernels table; }
-
-namespace scalar {                         // splat.h in double precision, for tests of the header itself
-using std::sqrt;
-inline double max(double a, double b) { return a > b ? a : b; }
-inline double clamp(double a, double lo, double hi) { return a < lo ? lo : a > hi ? hi : a; }
-inline bool ge(double a, double b) { return a >= b; }
-inline bool both(bool a, bool b) { return a && b; }
-inline double select(bool m, double a, double b) { return m ? a : b; }
-inline double only(bool m, double a) { return m ? a : 0.0; }
-#include "splat.h"
-}  // namespace scalar
 }  // namespace sigmasplat
 
 using namespace sigmasplat;
@@ -193,27 +181,6 @@ private:
     Context* context;
 };
 
-static void project_double(Doubles view, Doubles means, Doubles quats, Doubles scales, Doubles g, Doubles footprint, Doubles gradient) {
-    scalar::View<double> v;
-    need(view.size() * sizeof(double) == sizeof v, "a view has 27 numbers");
-    memcpy(&v, view.data(), sizeof v);
-    for (size_t i = 0; i < means.shape(0); i++) {
-        scalar::Shape<double> s;
-        memcpy(s.mean, means.data() + 3 * i, sizeof s.mean);
-        memcpy(s.quat, quats.data() + 4 * i, sizeof s.quat);
-        memcpy(s.scale, scales.data() + 3 * i, sizeof s.scale);
-        auto f = scalar::project(v, s, v.near_m);
-        scalar::add_slopes(v, s, v.near_m, f);
-        const double out[8] = {f.u, f.v, f.z, f.l1, f.l2, f.l3, f.slope_u, f.slope_v};
-        memcpy(footprint.data() + 8 * i, out, sizeof out);
-        scalar::FootprintGradient<double> gf;
-        memcpy(&gf, g.data() + 8 * i, sizeof gf);
-        scalar::ShapeGradient<double> gs;
-        scalar::project_backward<true>(v, s, v.near_m, gf, gs);
-        memcpy(gradient.data() + 16 * i, &gs, sizeof gs);
-    }
-}
-
 // Give the other threads of the calling thread's team the priority of idle time: any other thread takes their core at once.
 static void idle_workers() {
 #ifdef __linux__
@@ -248,7 +215,6 @@ NB_MODULE(_core, m) {
         active->project_backward(view.data(), means.data(), quats.data(), scales.data(), int64_t(means.shape(0)), radii.data(), g_means2d.data(),
                                  g_conics.data(), g_z.data(), g_means.data(), g_quats.data(), g_scales.data(), g_twist.data());
     });
-    m.def("project_double", project_double);
     m.def("adam_settle", [](Floats params, Floats moment1, Floats moment2, Ints last_step, ConstFloats rates, float beta1, float beta2, float epsilon, int step) {
         need(rates.size() == 17 && last_step.size() == params.shape(0) && moment1.size() == params.size() && moment2.size() == params.size(), "Adam's state must fit the rows");
         nb::gil_scoped_release unlocked;
