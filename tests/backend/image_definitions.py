@@ -56,7 +56,7 @@ def _quarter(image: Image) -> Image:
 
 
 def halved_color_in_numpy(color: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return what `halved_color` returns."""
+    """Return colour at half the size, as `resized_color` does."""
     small = np.empty((color.shape[0] // 2, color.shape[1] // 2, 3), np.float32)
     for c in range(3):
         rows = color[:, ::2, c] + color[:, 1::2, c]

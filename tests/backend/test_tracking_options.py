@@ -237,5 +237,5 @@ def test_the_second_frame_may_take_longer_and_turn_faster(
     config = changed(PAPER, iterations=15, first_iterations=first)
     follower = tracker.Tracker(config)
     for _ in range(2):
-        follower.track(field, view, PreparedFrame(target, live, frame=frame, whole=frame))
+        follower.track(field.params, view, PreparedFrame(target, live, frame=frame, whole=frame))
     assert seen == asked

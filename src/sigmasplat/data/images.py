@@ -24,17 +24,12 @@ def resized_color(color: NDArray[np.float32], width: int, height: int) -> NDArra
     if color.shape[:2] == (height, width):
         return color
     if color.shape[:2] == (2 * height, 2 * width):
-        return halved_color(color)
+        small = np.empty((height, width, 3), np.float32)  # the same bytes as Pillow's box filter
+        _core.halve_color(np.ascontiguousarray(color), small)
+        return small
     planes = [np.ascontiguousarray(color[..., c]) for c in range(3)]
-    small = [np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BOX)) for plane in planes]
-    return np.asarray(np.clip(np.stack(small, -1), 0.0, 1.0), np.float32)
-
-
-def halved_color(color: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return colour [2h, 2w, 3] at half the size [h, w, 3], the same bytes as Pillow's box filter."""
-    small = np.empty((color.shape[0] // 2, color.shape[1] // 2, 3), np.float32)
-    _core.halve_color(np.ascontiguousarray(color), small)
-    return small
+    means = [np.asarray(Image.fromarray(plane).resize((width, height), Image.Resampling.BOX)) for plane in planes]
+    return np.asarray(np.clip(np.stack(means, -1), 0.0, 1.0), np.float32)
 
 
 # ---- depth ----

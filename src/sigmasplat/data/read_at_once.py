@@ -26,21 +26,16 @@ def read_at_once(frame: Frame, readout: Readout) -> Frame:
     order. Pixels without depth move as those at the median depth.
     """
     cv2, color_at = opencv(), np.empty((2, *frame.depth_m.shape), np.float32)
-    color, depth_m = frame.color, _depth_before(frame.camera, frame.depth_m, readout, color_at)
+    color, depth_m = frame.color, depth_of_color(frame.camera, frame.depth_m, readout, color_at)
     if readout.times.color_rows_s:
         color = cv2.remap(color, *color_at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).clip(0.0, 1.0)
     return replace(frame, color=color, depth_m=depth_m)
 
 
-def depth_of_color(camera: Camera, depth_m: Image, readout: Readout) -> Image:
+def depth_of_color(camera: Camera, depth_m: Image, readout: Readout, color_at: Image | None = None) -> Image:
     """Return the depth [H, W] of what each pixel shows in colour, when its colour is read; 0 where none is read. Beyond
-    the depth image it is that of its border."""
-    return _depth_before(camera, depth_m, readout)
-
-
-def _depth_before(camera: Camera, depth_m: Image, readout: Readout, color_at: Image | None = None) -> Image:
-    """Return the depth [H, W] that the camera saw in the middle of colour, and write to color_at [2, H, W] the column
-    and row at which colour shows it. Without color_at, return that of `depth_of_color`."""
+    the depth image it is that of its border. With color_at [2, H, W]: the depth that the camera saw in the middle of
+    colour; the column and row at which colour shows it are written there."""
     c, before_m, some_m = camera, np.empty(depth_m.shape, np.float32), depth_m[::4, ::4]
     usual_m = float(np.median(some_m[some_m > 0])) if (some_m > 0).any() else 1.0
     _core.read_before(

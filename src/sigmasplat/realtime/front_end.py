@@ -106,7 +106,7 @@ class TrackedFrame:
     shown: Target | None = None
 
 
-NOTHING = GaussianField.empty()
+NOTHING = GaussianField.empty().params
 
 
 @dataclass(eq=False)
@@ -191,7 +191,7 @@ class FrontEnd:
             estimate, followed = self._begin(seen), True
         else:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
-                splats = NOTHING if self.snapshot is None else self.snapshot
+                splats = NOTHING if self.snapshot is None else self.snapshot.params
                 seen = fitted_to_map(self.tracker, splats, view, seen)
                 fit = self.tracker.track(splats, view, seen, seen.frame.prior, should_stop)
                 given += self.settled(self.tracker.motion, view)
@@ -239,7 +239,10 @@ class FrontEnd:
         """Track the next frames relative to a keyframe, before the map has weights for its pixels; return what the map
         gets, unless the keyframe waits."""
         if not found.reads_late:
-            splats, connected = NOTHING if self.snapshot is None else self.snapshot, found.connected and not self.found
+            splats, connected = (
+                NOTHING if self.snapshot is None else self.snapshot.params,
+                found.connected and not self.found,
+            )
             T = found.T_world_camera
             found = replace(found, seen=fitted_keyframe(self.tracker, splats, view, found.seen, T, connected))
         self.tracker.follow(found.followed)

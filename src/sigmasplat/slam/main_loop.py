@@ -52,7 +52,7 @@ class MainLoop(MappingBackend):
             view = self.view_for(frame)
             self._timer.start_kernels(view)
             seen = self.observed(frame, view, self.extractor)
-        return fitted_to_map(self.tracker, self.mapper.field, view, seen) if self.steps else seen
+        return fitted_to_map(self.tracker, self.mapper.field.params, view, seen) if self.steps else seen
 
     def settle_late(self, after: CameraMotion) -> Matrix:
         """Fit the last frame again, if its sensor reads late, now that its motion is known; map it if it is a keyframe.
@@ -78,14 +78,14 @@ class MainLoop(MappingBackend):
         seen, keyframe = first.seen.at_once(self.view, self.config), self.mapper.keyframes[-1]
         keyframe.target, keyframe.photo = seen.target, seen.photo(self.config)
         self.images.kept.clear()
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, first.T_world_camera, first.front)
+        self.tracker.keep_keyframe(self.mapper.field.params, self.view, seen, first.T_world_camera, first.front)
 
     def _map(self, found: NewestFrame) -> Matrix:
         """Map a keyframe, as if it was read at once and without what moves in front, in the exposure of the map; cut
         the submap if a rule ends it here; look for the place in other components. Return its pose."""
         view, tracker, number = self.view, self.tracker, found.number
         seen, T = found.seen.at_once(view, self.config), found.T_world_camera
-        seen = fitted_keyframe(tracker, self.mapper.field, view, seen, T, found.connected).without(found.front)
+        seen = fitted_keyframe(tracker, self.mapper.field.params, view, seen, T, found.connected).without(found.front)
         if self.config.tracking.exposure and self.config.mapping.colors == "code":
             seen = seen.without_exposure(found.exposure)
         hop = self.hop_to(se3.inverse(T), found.alignment, found.wrong) if found.connected else UNKNOWN_HOP
@@ -106,7 +106,7 @@ class MainLoop(MappingBackend):
         self.tracker.times = self.graph.times
         self.tracker.move_by(T_submap_camera @ se3.inverse(T_tracked))
         seen.live = seen.live.read(self.graph.times.read(seen.reading))  # if it has just shown the times
-        self.tracker.keep_keyframe(self.mapper.field, self.view, seen, T_submap_camera, found.front)
+        self.tracker.keep_keyframe(self.mapper.field.params, self.view, seen, T_submap_camera, found.front)
         return T_submap_camera
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
@@ -122,7 +122,7 @@ class MainLoop(MappingBackend):
     def _locate(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            fit = self.tracker.track(self.mapper.field, self.view, seen, seen.frame.prior)
+            fit = self.tracker.track(self.mapper.field.params, self.view, seen, seen.frame.prior)
         if self.late is not None:
             fit.T_camera_world = fit.T_camera_world @ se3.inverse(self.settle_late(self.tracker.motion))
         lost, held_back = self.tracker.lost, self._is_held_back
@@ -172,7 +172,7 @@ class MainLoop(MappingBackend):
         if submap == len(self.store):
             self.found_at(place)
             estimate.T_submap_camera = place.T_submap_camera
-            self.tracker.move_to(self.mapper.field, self.view, place.keyframe, place.T_submap_camera)
+            self.tracker.move_to(self.mapper.field.params, self.view, place.keyframe, place.T_submap_camera)
         else:
             completed(self.branch_at(place))
             estimate.T_submap_camera, estimate.mapped = np.eye(4), True

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from torch import Tensor
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.data import se3
@@ -10,7 +11,6 @@ from sigmasplat.data.frame import PosePrior
 from sigmasplat.fit.align import ITERATIONS, align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.render.view import View
-from sigmasplat.tracking.prepared_frame import Splats
 from sigmasplat.types import Matrix, ShouldStop
 
 
@@ -79,9 +79,9 @@ def predict(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrio
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What all fits of one frame share: the map, its view, where the camera is expected, and whether to stop."""
+    """What all fits of one frame share: the map (rows [N, 17]), its view, where the camera is expected, and whether to stop."""
 
-    field: Splats
+    params: Tensor
     view: View
     prediction: PosePrediction
     should_stop: ShouldStop

@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+from torch import Tensor
 
 from sigmasplat.data import se3
 from sigmasplat.render.view import View
 from sigmasplat.tracking.predicted_depth_fit import DepthFit
-from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix
 
@@ -15,18 +16,18 @@ OPAQUE = 0.9
 """The map shows a surface where its alpha is above this."""
 
 
-def fitted_to_map(tracker: Tracker, field: Splats, view: View, seen: PreparedFrame) -> PreparedFrame:
+def fitted_to_map(tracker: Tracker, params: Tensor, view: View, seen: PreparedFrame) -> PreparedFrame:
     """Return a frame whose depth agrees with the map at the pose where it is expected, and remember the fit; the same
-    frame without `tracking.fit_depth`."""
+    frame without `tracking.fit_depth`. params: rows [N, 17] of the map."""
     if not tracker.config.fit_depth:
         return seen
     T_world_camera = tracker.prediction(seen.frame.prior).predicted
-    tracker.depth = _fitted(tracker.depth, field, view, seen, T_world_camera)
+    tracker.depth = _fitted(tracker.depth, params, view, seen, T_world_camera)
     return seen.with_depth(tracker.depth.applied(seen.frame.depth_m))
 
 
 def fitted_keyframe(
-    tracker: Tracker, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix, connected: bool
+    tracker: Tracker, params: Tensor, view: View, seen: PreparedFrame, T_world_camera: Matrix, connected: bool
 ) -> PreparedFrame:
     """Return a frame that is to be mapped with the depth that its tracked pose and the views of earlier keyframes
     show, and remember the fit; the same frame without `tracking.fit_depth`.
@@ -42,17 +43,17 @@ def fitted_keyframe(
         hop = keyframe.T_camera_world @ T_world_camera if connected and keyframe is not None else np.eye(4)
         depth = replace(depth, shape=depth.shape.after(seen.image.with_depth(seen.frame.depth_m), hop, extractor))
     if connected:
-        depth = _fitted(depth, field, view, seen, T_world_camera)
+        depth = _fitted(depth, params, view, seen, T_world_camera)
     tracker.depth = depth
     return seen.with_depth(depth.applied(seen.frame.depth_m))
 
 
-def _fitted(depth: DepthFit, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> DepthFit:
+def _fitted(depth: DepthFit, params: Tensor, view: View, seen: PreparedFrame, T_world_camera: Matrix) -> DepthFit:
     """Return the fit of a frame to the depth of the map from a camera, where the map is opaque."""
-    if not len(field.params):
+    if not len(params):
         return depth
     camera = view.camera
-    view.forward(field.params, se3.inverse(T_world_camera))
+    view.forward(params, se3.inverse(T_world_camera))
     alpha, surface = (plane[: camera.height, : camera.width].cpu().numpy() for plane in (view.alpha, view.sums[3]))
     known_m = np.where(alpha > OPAQUE, surface / np.maximum(alpha, np.float32(OPAQUE)), np.float32(0.0))
     return depth.fitted(seen.frame.depth_m, known_m)

@@ -1,7 +1,6 @@
 """One frame, or one keyframe, in the forms that tracking and mapping need."""
 
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,13 +164,6 @@ def refuse_first_without_depth(frame: Frame, config: Config) -> None:
             f"frame {frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
             "to start a map from; check the depth scale or start at a later one"
         )
-
-
-class Splats(Protocol):
-    """What tracking reads of a map: rows of splats [N, 17]."""
-
-    @property
-    def params(self) -> Tensor: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field as dataclass_field, replace
 
 import numpy as np
+from torch import Tensor
 
 from sigmasplat.config import Config, TrackingConfig
 from sigmasplat.data import se3
@@ -22,7 +23,7 @@ from sigmasplat.tracking.moving.pose_pullers import has_pulled, is_scene, suspec
 from sigmasplat.tracking.pose_prediction import CameraMotion, Given, PosePrediction, odometry, predict
 from sigmasplat.tracking.pose_validation import TrackingStatistics
 from sigmasplat.tracking.predicted_depth_fit import NOTHING_FITTED, DepthFit
-from sigmasplat.tracking.prepared_frame import PreparedFrame, Splats, TrackedKeyframe, mapped_keyframe
+from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.recovery import has_depth
 from sigmasplat.types import Matrix, ShouldStop, never, unless
 
@@ -70,19 +71,19 @@ class Tracker:
         self.motion = CameraMotion(seen.frame.timestamp_s)
 
     def track(
-        self, field: Splats, view: View, seen: PreparedFrame, prior: PosePrior = NO_PRIOR,
+        self, params: Tensor, view: View, seen: PreparedFrame, prior: PosePrior = NO_PRIOR,
         should_stop: ShouldStop = never,
     ) -> PoseFit:  # fmt: skip
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
-        prior: what is known of the pose apart from the images. should_stop: asked before each further guess; if it
+        params: rows [N, 17] of the map; prior: what is known of the pose apart from the images. should_stop: asked before each further guess; if it
         returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
         else the last pose), and the motion is reset.
         """
         seen.live = seen.live.noisier(self.statistics.noise)
         seen.move(self.motion.rate(), self.times)
-        given, shown = Given(field, view, self.prediction(prior), should_stop), seen.shown
+        given, shown = Given(params, view, self.prediction(prior), should_stop), seen.shown
         predicted = given.prediction.predicted
         if given.prediction.given:
             best = self._fit(given, shown, predicted, patience=0)
@@ -202,7 +203,7 @@ class Tracker:
         if c.method == "adam":
             config = c if self.started else c.without_motion()
             steps = patience * config.iterations
-            return fit_pose_adam(given.field.params, given.view, seen.target, T_camera_world, config, steps)
+            return fit_pose_adam(given.params, given.view, seen.target, T_camera_world, config, steps)
         assert self.keyframe is not None  # the first frame of each map is one
         return fit_pose_align(self.keyframe, seen.live, T_camera_world, c, patience > 0)
 
@@ -250,11 +251,11 @@ class Tracker:
     # ---- keyframes ----
 
     def keep_keyframe(
-        self, field: Splats, view: View, seen: PreparedFrame, T_world_camera: Matrix, front: DynamicMask | None
+        self, params: Tensor, view: View, seen: PreparedFrame, T_world_camera: Matrix, front: DynamicMask | None
     ) -> None:
         """Use a keyframe that was just mapped: its pose, and its image as the reference of the next frames; front: what
         was in front of the scene in it."""
-        self.follow(mapped_keyframe(field.params, view, seen, T_world_camera, self.config, front))
+        self.follow(mapped_keyframe(params, view, seen, T_world_camera, self.config, front))
 
     def came_from(self, previous: Matrix) -> None:
         """Take note that the frame before the last one was at another pose [4, 4] than thought."""
@@ -266,10 +267,10 @@ class Tracker:
         self.keyframe = keyframe.reference
         self.keyframe_features, self.keyframe_front = keyframe.image, keyframe.front
 
-    def move_to(self, field: Splats, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
+    def move_to(self, params: Tensor, view: View, keyframe: TrackedKeyframe, T_world_camera: Matrix) -> None:
         """Continue at another pose after a lost frame, with a keyframe as the reference of the next frames."""
         self.previous, self.lost = T_world_camera, False
-        self.follow(keyframe.weighed(field.params, view, self.config))
+        self.follow(keyframe.weighed(params, view, self.config))
 
     def continue_elsewhere(self, apart: bool) -> None:
         """Go on where the search has found the camera, or in a new map (`apart`)."""
