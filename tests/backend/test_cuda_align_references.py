@@ -159,7 +159,6 @@ def test_what_a_tracker_remembers_is_kept_and_read_back(tmp_path: Path) -> None:
             Camera,
             TrackingStatistics,
             dynamic_detector.DynamicDetector,
-            dynamic_detector.DepthHistory,
             DepthFit,
             DepthShape,
         ),

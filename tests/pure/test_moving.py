@@ -16,7 +16,7 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.tracking.moving.dynamic_detector import DepthHistory
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
@@ -69,22 +69,22 @@ def thing(depth_m: NDArray[np.float32]) -> DynamicMask:
 
 
 def test_rest_ends_motion() -> None:
-    memory, found = DepthHistory(), list[bool]()
+    memory, found = DynamicDetector(MovingConfig(find=True, still_frames=FRAMES)), list[bool]()
     for n in range(80):
         depth_m = with_box(min(20 + n, 60))
-        found.append(memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA, FRAMES) is not None)
-        memory = memory.after(depth_m, np.eye(4), FRAMES)
+        found.append(memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA) is not None)
+        memory = memory.after(depth_m, np.eye(4))
     assert all(found[:45]) and not any(found[75:])
 
 
 def test_what_comes_back_to_an_earlier_place_is_not_at_rest() -> None:
-    memory, left = DepthHistory(), [60] * 11 + [110] * 10 + [60] * 20
+    memory, left = DynamicDetector(MovingConfig(find=True, still_frames=FRAMES)), [60] * 11 + [110] * 10 + [60] * 20
     moved, found = with_box(60) == BOX_M, None
     for n, column in enumerate(left):
         depth_m = with_box(column)
-        found = memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA, FRAMES)
+        found = memory.still_moving(thing(depth_m), depth_m, np.eye(4), CAMERA)
         assert found is not None, f"frame {n} is taken for at rest"
-        memory = memory.after(depth_m, np.eye(4), FRAMES)
+        memory = memory.after(depth_m, np.eye(4))
     assert found is not None and found.hidden[moved].all()
 
 

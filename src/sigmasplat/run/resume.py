@@ -38,7 +38,7 @@ from sigmasplat.slam.results import Step, Steps
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.drift import Drift
 from sigmasplat.tracking.feature_image import FeatureImage
-from sigmasplat.tracking.moving.dynamic_detector import DepthHistory, DynamicDetector, RememberedDepth
+from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector, RememberedDepth
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.newest_frame import NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
@@ -50,7 +50,7 @@ from sigmasplat.tracking.relocaliser import Relocaliser
 from sigmasplat.tracking.tracker import Tracker
 
 CLASSES: tuple[type, ...] = (
-    Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthHistory, DepthShape,
+    Alignments, Atlas, Camera, CameraMotion, Column, Confidence, DepthFit, DepthShape,
     DescribedSubmaps, Detail, Drift, DynamicDetector, DynamicMask, Edges, FeatureImage, Frame, GaussianField,
     GrowingGraph, Keyframe, KeyframePoses, Loop, LoopCloser, Loops, Mapper, NewestFrame, PendingSearch, Photo, Picture,
     Places, PosePrior, Poses, PreparedFrame, Pyramid, Readout, Readouts, Recovery, Reference, RelativePose, Relocaliser,

@@ -169,9 +169,10 @@ class Tracker:
 
     def _notice_rest(self, seen: PreparedFrame, T_world_camera: Matrix) -> None:
         """Take what has come to rest for a part of the scene, and remember the frame."""
-        front = self.detector.still_moving(self.front, seen, T_world_camera)
+        depth_m = seen.target.depth_image.numpy()
+        front = self.detector.still_moving(self.front, depth_m, T_world_camera, seen.target.camera)
         self.keyframe_front = None if self.front is not None and front is None else self.keyframe_front
-        self.front, self.detector = front, self.detector.after(seen, T_world_camera)
+        self.front, self.detector = front, self.detector.after(depth_m, T_world_camera)
 
     def _stands(self, fit: PoseFit) -> bool:
         return not (self._is_lost(fit) or self._doubts(fit))

@@ -24,8 +24,6 @@ from sigmasplat.tracking.moving.pose_pullers import is_scene
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
 
-# ---- what recent frames saw ----
-
 EVERY = 5
 """Every fifth frame is remembered."""
 COLUMNS_TESTED = 80
@@ -43,57 +41,6 @@ class RememberedDepth:
     T_world_camera: Matrix
 
 
-@dataclass(frozen=True, eq=False)
-class DepthHistory:
-    """The number of frames so far, and what some recent ones saw, the newest last."""
-
-    frames: int = 0
-    seen: tuple[RememberedDepth, ...] = ()
-
-    def after(self, depth_m: Depth, T_world_camera: Matrix, most_frames: int) -> "DepthHistory":
-        """Return the history after one more frame, of at most `most_frames`."""
-        if self.frames % EVERY:
-            return replace(self, frames=self.frames + 1)
-        seen = (*self.seen, RememberedDepth(self.frames, depth_m, T_world_camera))[-(most_frames // EVERY + 1) :]
-        return DepthHistory(self.frames + 1, seen)
-
-    def moved_by(self, T_new_old: Matrix) -> "DepthHistory":
-        """Return the history in other coordinates [4, 4]."""
-        return replace(self, seen=tuple(replace(s, T_world_camera=T_new_old @ s.T_world_camera) for s in self.seen))
-
-    def still_moving(
-        self, front: DynamicMask, depth_m: Depth, T_world_camera: Matrix, camera: Camera, frames: int
-    ) -> DynamicMask | None:
-        """Return what is in front without the things that have stayed in place for this number of frames (0 = any)."""
-        before = [k for k, earlier in enumerate(self.seen) if self.frames - earlier.number >= frames]
-        if not frames or not before:
-            return front
-        step = max(2, camera.width // COLUMNS_TESTED)
-        depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
-        regions, boxes = labelled(smooth(depth))
-        count = len(boxes)
-        rests = np.ones(count + 1, np.bool_)
-        for earlier in self.seen[before[-1] :]:  # what comes back to an earlier place has not rested there
-            scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
-            known, same = seen_again(scene, depth, camera, step)
-            sizes, of_known, of_same = (
-                np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)
-            )
-            rests &= (of_same >= AT_REST * of_known) & (of_known >= KNOWN * sizes)
-        rests[0] = False
-        if not rests.any():
-            return front
-        moving = widened((regions > 0) & ~rests[regions], 3)
-        if moving.sum() < LEAST_REGION * moving.size:
-            return None
-        whole, hidden = enlarged(moving, step, depth_m)
-        whole, hidden = whole & (front.depth_m > 0), hidden & front.hidden
-        depths = np.where(whole, front.depth_m, np.float32(0.0)), np.where(hidden, front.scene_m, depth_m)
-        return DynamicMask(hidden, *depths)
-
-
-# ---- what moves ----
-
 FRONT = 0.03
 """What is in front is looked for if at least this share of the compared points is nearer than the reference."""
 
@@ -103,10 +50,12 @@ RENEWED = 0.7
 
 @dataclass(frozen=True, eq=False)
 class DynamicDetector:
-    """What is known of moving things between two frames: what recent frames saw; nothing without `config.find`."""
+    """What is known of moving things between two frames: the number of frames since the camera was found, and what some
+    recent ones saw, the newest last; nothing without `config.find`."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
-    history: DepthHistory = field(default_factory=DepthHistory)
+    frames: int = 0
+    recent: tuple[RememberedDepth, ...] = ()
 
     def suspects(self, found: Comparison, known: DynamicMask | None, should_stop: ShouldStop) -> bool:
         """Return whether something may be in front of the scene, or may have left its place in it; known: what was
@@ -150,25 +99,51 @@ class DynamicDetector:
             return False
         return min(found.common, found.covered) < RENEWED
 
-    def after(self, seen: PreparedFrame, T_world_camera: Matrix) -> "DynamicDetector":
-        """Return what is known after a frame that is not lost."""
+    def after(self, depth_m: Depth, T_world_camera: Matrix) -> "DynamicDetector":
+        """Return what is known after a frame with this depth [H, W], m, that is not lost."""
         if not self.config.find:
             return self
-        depth_m = seen.target.depth_image.numpy()
-        return replace(self, history=self.history.after(depth_m, T_world_camera, self.config.still_frames))
+        if self.frames % EVERY:
+            return replace(self, frames=self.frames + 1)
+        recent = (*self.recent, RememberedDepth(self.frames, depth_m, T_world_camera))
+        return replace(self, frames=self.frames + 1, recent=recent[-(self.config.still_frames // EVERY + 1) :])
 
     def still_moving(
-        self, front: DynamicMask | None, seen: PreparedFrame, T_world_camera: Matrix
+        self, front: DynamicMask | None, depth_m: Depth, T_world_camera: Matrix, camera: Camera
     ) -> DynamicMask | None:
-        """Return what is in front without what has come to rest, which is part of the scene again."""
-        if front is None or not self.config.find:
+        """Return what is in front without the things that have stayed in place for `still_frames` (0 = any): they have
+        come to rest, and are part of the scene again. depth_m [H, W], T_world_camera [4, 4]: of the live image."""
+        frames = self.config.still_frames
+        before = [k for k, earlier in enumerate(self.recent) if self.frames - earlier.number >= frames]
+        if front is None or not self.config.find or not frames or not before:
             return front
-        target, frames = seen.target, self.config.still_frames
-        return self.history.still_moving(front, target.depth_image.numpy(), T_world_camera, target.camera, frames)
+        step = max(2, camera.width // COLUMNS_TESTED)
+        depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
+        regions, boxes = labelled(smooth(depth))
+        count = len(boxes)
+        rests = np.ones(count + 1, np.bool_)
+        for earlier in self.recent[before[-1] :]:  # what comes back to an earlier place has not rested there
+            scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
+            known, same = seen_again(scene, depth, camera, step)
+            sizes, of_known, of_same = (
+                np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)
+            )
+            rests &= (of_same >= AT_REST * of_known) & (of_known >= KNOWN * sizes)
+        rests[0] = False
+        if not rests.any():
+            return front
+        moving = widened((regions > 0) & ~rests[regions], 3)
+        if moving.sum() < LEAST_REGION * moving.size:
+            return None
+        whole, hidden = enlarged(moving, step, depth_m)
+        whole, hidden = whole & (front.depth_m > 0), hidden & front.hidden
+        depths = np.where(whole, front.depth_m, np.float32(0.0)), np.where(hidden, front.scene_m, depth_m)
+        return DynamicMask(hidden, *depths)
 
     def moved_by(self, T_new_old: Matrix) -> "DynamicDetector":
         """Return the same in other coordinates [4, 4]."""
-        return replace(self, history=self.history.moved_by(T_new_old))
+        recent = tuple(replace(s, T_world_camera=T_new_old @ s.T_world_camera) for s in self.recent)
+        return replace(self, recent=recent)
 
     def cleared(self) -> "DynamicDetector":
         """Return the watch with nothing remembered."""
