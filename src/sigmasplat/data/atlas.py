@@ -1,7 +1,7 @@
 """All poses: of submaps in the world, of keyframes in submaps, of frames relative to keyframes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,13 @@ class Atlas:
                 if component == moved:
                     chain[s] = se3.orthonormalise(motion @ chain[s])
         self.components = [kept if component == moved else component for component in self.components]
+
+    def copied(self) -> "Atlas":
+        """Return a copy of the poses that later frames do not change; the places of frames are in the same memory."""
+        return replace(
+            self, anchors=self.anchors.copied(), keyframe_poses=self.keyframe_poses.copied(),
+            places=self.places.first(len(self.places)), components=list(self.components), refined=dict(self.refined),
+        )  # fmt: skip
 
     def members(self, component: int) -> list[int]:
         """Return the submaps of a component."""

@@ -24,7 +24,6 @@ from sigmasplat.final.fusion import count_keyframes, fuse, fusion_views
 from sigmasplat.final.refinement import Clock, KeyframeReader, refine
 from sigmasplat.final.stores import RefinedStore
 from sigmasplat.final.tsdf import packed
-from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.graph.path_covariance import PathCovariance
 from sigmasplat.mapping.moving import contradicted, is_free, remove
 from sigmasplat.render.view import View
@@ -61,13 +60,13 @@ def final_map(
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     if config.moving.find:
         store = without_moving(store, anchors, config.moving)
-    field = seed(store, anchors, config)
-    if config.moving.find:
-        carved(field, store, anchors, config.moving)
+    field, keyframes = seed(store, anchors, config), KeyframeReader(store, anchors, view)
+    if config.moving.find:  # remove splats from space that the keyframes of all submaps see to be free
+        remove(field, is_free(field.means.numpy(), keyframes, config.moving.carve_votes))
     if not config.final.iterations:
         return FinalMap(field)
     field.keep(torch.from_numpy(z_order(field.means.numpy())))
-    on_device, keyframes = field.to(view.sums.device), KeyframeReader(store, anchors, view)
+    on_device = field.to(view.sums.device)
     clock = Clock(working_seconds(keyframes, config.final))
     done = len(refine(on_device, keyframes, config, view, random, progress, clock))
     clock = clock.next_stage(config.final.seconds)
@@ -293,16 +292,3 @@ def _compared(poses: Sequence[Matrix]) -> Iterator[list[int]]:
             apart = np.linalg.norm(positions[:rest] - positions[late], axis=1) + TURN_M * turn
             others += np.argsort(apart, kind="stable")[:REVISITS].tolist()
         yield others
-
-
-def carved(field: GaussianField, store: SubmapStore, anchors: Sequence[Matrix], config: MovingConfig) -> None:
-    """Remove the splats of a map in the world from space that the keyframes of all submaps see to be free."""
-
-    def keyframes() -> Iterator[Keyframe]:
-        for s in range(len(store)):
-            submap = store.load(s)
-            for k, T in enumerate(submap.T_submap_camera):
-                size = submap.camera.height, submap.camera.width
-                yield Keyframe(k, Target.of_picture(store.picture(s, k), submap.camera, size), anchors[s] @ T)
-
-    remove(field, is_free(field.means.numpy(), keyframes(), config.carve_votes))

@@ -13,12 +13,12 @@ from sigmasplat.data.trajectory import APART, RELOCALISED
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import fit_pose_align
 from sigmasplat.graph.path_covariance import NO_ERRORS
-from sigmasplat.realtime.front_end import Offer, Search, Snapshot, TrackedFrame
+from sigmasplat.realtime.front_end import Snapshot, TrackedFrame
 from sigmasplat.slam.mapping_backend import SLICES_PER_FRAME
 from sigmasplat.slam.results import StepTimer
-from sigmasplat.system.array_interface import Before, Correction, correction_since
+from sigmasplat.system.array_interface import Correction, correction_since
 from sigmasplat.system.slam import Slam
-from sigmasplat.tracking.newest_frame import AS_GOOD
+from sigmasplat.tracking.newest_frame import AS_GOOD, NewestFrame
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe, mapped_keyframe
 from sigmasplat.tracking.relocaliser import Relocation
 from sigmasplat.types import Matrix
@@ -39,7 +39,7 @@ class BackEnd:
         self.given: queue.SimpleQueue[TrackedFrame | Callable[[], None]] = queue.SimpleQueue()
         self.last: Snapshot | None = None
         self.with_errors = False
-        self._before = Before.of(system)
+        self._before = system.atlas.copied()
         self._pending: deque[TrackedFrame | Callable[[], None]] = deque()
         self._spare, self._added = 0, 0
         self._undescribed: TrackedKeyframe | None = None
@@ -111,7 +111,7 @@ class BackEnd:
             return each.T_submap_camera
         return T_submap_keyframe @ se3.inverse(known) @ each.T_submap_camera
 
-    def _realigned(self, each: TrackedFrame, offer: Offer) -> tuple[Matrix, Alignment | None]:
+    def _realigned(self, each: TrackedFrame, offer: NewestFrame) -> tuple[Matrix, Alignment | None]:
         """Return a keyframe's pose and its alignment to the keyframe before it. Both are fitted again, with the weights
         of that keyframe's pixels, if it was not mapped yet when the frame was tracked: errors of keyframes add up."""
         T, first, last = self._pose(each), offer.alignment, self.last
@@ -125,7 +125,7 @@ class BackEnd:
             return T, first
         return se3.orthonormalise(se3.inverse(fit.T_camera_world)), fit.alignment
 
-    def _map(self, each: TrackedFrame, offer: Offer) -> Iterator[None]:
+    def _map(self, each: TrackedFrame, offer: NewestFrame) -> Iterator[None]:
         """Map a keyframe. If another one waits, it is only added to the map, and the fit is left to a later one, unless
         the submap ends: loops do not correct the drift within a submap."""
         system, number = self.system, each.number
@@ -162,7 +162,7 @@ class BackEnd:
         self.system.atlas.place_frame(self.system.atlas.keyframe_poses.last[-1])
         self.system.steps.append(each.step)
 
-    def _reference(self, seen: PreparedFrame, T_submap_camera: Matrix, offer: Offer | None) -> TrackedKeyframe:
+    def _reference(self, seen: PreparedFrame, T_submap_camera: Matrix, offer: NewestFrame | None) -> TrackedKeyframe:
         system, front = self.system, None if offer is None else offer.front
         c = system.config.tracking
         self._undescribed = mapped_keyframe(system.mapper.field.params, system.view, seen, T_submap_camera, c, front)
@@ -188,19 +188,19 @@ class BackEnd:
 
     # ---- lost and found ----
 
-    def _search(self, each: TrackedFrame, search: Search) -> Iterator[None]:
+    def _search(self, each: TrackedFrame, seen: PreparedFrame) -> Iterator[None]:
         """Search the whole map for a frame, and tell tracking the result."""
         system, number = self.system, each.number
         self._timer = system.start_timer()
         waiting = (each for each in self._pending if isinstance(each, TrackedFrame))
         recovered = self._take() and any(not each.step.lost for each in waiting)  # the camera was tracked again
-        place = None if recovered else (yield from system.relocalising(search.seen))
+        place = None if recovered else (yield from system.relocalising(seen))
         yield
         if place is not None:
-            yield from self._go_to(place, number, search.seen)
-        elif search.apart and not recovered:
+            yield from self._go_to(place, number, seen)
+        elif each.apart and not recovered:
             yield from system.begin_apart()
-            yield from self._map_found(number, search.seen, APART)
+            yield from self._map_found(number, seen, APART)
         elif self.last is not None:
             last = replace(self.last, state="", searched=number, loops=system.loops.copied(), seconds=0.0)
             self._hand_over(replace(last, correction=None))
@@ -226,8 +226,8 @@ class BackEnd:
 
     def correction(self) -> Correction | None:
         """Return how earlier poses have changed since the last call, if a function of the caller wants it."""
-        before, self._before = self._before, Before.of(self.system)
-        return correction_since(self.system, before) if self.system.listeners else None
+        before, self._before = self._before, self.system.atlas.copied()
+        return correction_since(before, self.system.atlas) if self.system.listeners else None
 
     def _publish(self, number: int, keyframe: TrackedKeyframe, poses: dict[int, Matrix], state: str) -> None:
         """Hand a snapshot of the active map to tracking."""

@@ -16,7 +16,6 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.readout import UNKNOWN_TIMES, SensorTimes
 from sigmasplat.data.trajectory import APART, RELOCALISED, TRACKED
-from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pose import PoseFit
 from sigmasplat.fit.target import Target
 from sigmasplat.graph.loops import Loop, Loops
@@ -26,7 +25,6 @@ from sigmasplat.render.view import View
 from sigmasplat.slam.results import Step, StepTimer, SubmapState, make_step
 from sigmasplat.system.array_interface import Correction
 from sigmasplat.tracking.keyframe_rule import becomes_keyframe, hop_alignment, is_held_back, is_mappable, may_validate
-from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
 from sigmasplat.tracking.newest_frame import FrameEstimate, NewestFrame
 from sigmasplat.tracking.pose_prediction import CameraMotion
 from sigmasplat.tracking.predicted_depth_frames import fitted_keyframe, fitted_to_map
@@ -68,32 +66,13 @@ class Snapshot:
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
-    """A lost frame to be found in the whole map; apart: whether a new map begins if it is not found."""
-
-    seen: PreparedFrame
-    apart: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Offer:
-    """A keyframe for the map; alignment: to the keyframe before it; front: what is in front of the scene; wrong: the
-    probability that its tracked pose is wrong."""
-
-    seen: PreparedFrame
-    alignment: Alignment | None = None
-    front: DynamicMask | None = None
-    exposure: tuple[float, float] = (0.0, 0.0)
-    wrong: float = 0.0
-
-
-@dataclass(frozen=True, eq=False)
 class TrackedFrame:
     """A tracked frame: its number; its step as reported; its pose T_submap_camera [4, 4] and those of the keyframes
     that it may be placed by, all in the coordinates of the tracker at that time.
 
-    based_on: the frame of the snapshot that it was tracked with, −1 = none; offer: if it is a keyframe; search: if it
-    is searched for; shown: its images if it may become a validation view.
+    based_on: the frame of the snapshot that it was tracked with, −1 = none; offer: what the map gets if
+    it is a keyframe; search: if it is lost and searched for; shown: its images if it may become a validation view;
+    apart: whether a new map begins if it is not found.
     """
 
     number: int
@@ -101,9 +80,10 @@ class TrackedFrame:
     T_submap_camera: Matrix
     poses: Poses
     based_on: int = -1
-    offer: Offer | None = None
-    search: Search | None = None
+    offer: NewestFrame | None = None
+    search: PreparedFrame | None = None
     shown: Target | None = None
+    apart: bool = False
 
 
 NOTHING = GaussianField.empty().params
@@ -208,7 +188,8 @@ class FrontEnd:
         self.frames += 1
         based_on = -1 if self.snapshot is None else self.snapshot.frame
         shown = self._validation_view(number, seen, view, estimate)
-        newest = TrackedFrame(number, step, estimate.T_submap_camera, self.poses, based_on, offer, search, shown)
+        T, apart = estimate.T_submap_camera, self.recovery.gives_up
+        newest = TrackedFrame(number, step, T, self.poses, based_on, offer, search, shown, apart)
         if not found.reads_late:
             return step, [*given, newest]
         self.late = found, newest
@@ -235,7 +216,7 @@ class FrontEnd:
         self.offered, self.waits = 1, (0,)
         return FrameEstimate(np.eye(4), TRACKED, mapped=True)
 
-    def _follow(self, found: NewestFrame, view: View) -> Offer | None:
+    def _follow(self, found: NewestFrame, view: View) -> NewestFrame | None:
         """Track the next frames relative to a keyframe, before the map has weights for its pixels; return what the map
         gets, unless the keyframe waits."""
         if not found.reads_late:
@@ -264,14 +245,14 @@ class FrontEnd:
             self.refused += 1
         return True
 
-    def _search(self, seen: PreparedFrame) -> Search | None:
+    def _search(self, seen: PreparedFrame) -> PreparedFrame | None:
         """Return the frame to be searched for in the whole map, if it is lost and no other is searched."""
-        apart = self.recovery.gives_up
-        wanted = self.tracker.lost and (self.config.recovery.relocalise or apart) and usable(seen)
+        may = self.config.recovery.relocalise or self.recovery.gives_up
+        wanted = self.tracker.lost and may and usable(seen)
         if self.searching >= 0 or not wanted:
             return None
         self.searching = self.frames
-        return Search(seen.separate(), apart)
+        return seen.separate()
 
     def _validation_view(self, number: int, seen: PreparedFrame, view: View, estimate: FrameEstimate) -> Target | None:
         """Return the images of a frame that may become a validation view."""
@@ -295,7 +276,6 @@ class FrontEnd:
         return make_step(seen, estimate, active, self.tracker, loops, seconds, waiting)
 
 
-def _offered(found: NewestFrame) -> Offer:
+def _offered(found: NewestFrame) -> NewestFrame:
     """Return what the map gets of a keyframe: images that tracking does not change."""
-    seen = found.seen.without(found.front).separate()
-    return Offer(seen, found.alignment, found.front, found.exposure, found.wrong)
+    return replace(found, seen=found.seen.without(found.front).separate())

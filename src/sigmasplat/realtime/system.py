@@ -197,8 +197,7 @@ class RealTime(ArrayInterface):
     def _tell(self) -> None:
         """Call the caller's functions for what has arrived."""
         arrived, self._corrections = self._corrections, []
-        for correction in arrived:
-            tell(self.listeners, correction)
+        tell(self.listeners, arrived)
 
     @property
     def snapshot(self) -> Snapshot | None:

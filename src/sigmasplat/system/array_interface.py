@@ -2,10 +2,10 @@
 earlier poses."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from sigmasplat.data.frame import Frame
 from sigmasplat.data.frame_arrays import Array, ColorOrder, frame_from_arrays
 from sigmasplat.data.trajectory import LOST
 from sigmasplat.errors import SourceError
-from sigmasplat.slam.results import Step, Steps
+from sigmasplat.slam.results import Step
 from sigmasplat.types import Matrix
 
 
@@ -35,62 +35,35 @@ class Correction:
     moved_m: Matrix
 
 
-class Observed(Protocol):
-    """What corrections are found from."""
-
-    atlas: Atlas
-    steps: Steps
-    listeners: "Listeners"
-
-
-@dataclass(frozen=True, eq=False)
-class Before:
-    """The state before a step, as far as corrections need it."""
-
-    atlas: Atlas
-    steps: int
-
-    @staticmethod
-    def of(slam: Observed) -> "Before":
-        """Copy what a step may change."""
-        a = slam.atlas
-        kept = replace(
-            a, anchors=a.anchors.copied(), components=list(a.components), refined=dict(a.refined),
-            keyframe_poses=a.keyframe_poses.copied(),
-        )  # fmt: skip
-        return Before(kept, len(slam.steps))
-
-
 Listeners = list[Callable[[Correction], object]]
 
 
 @contextmanager
-def notifying(slam: Observed) -> Iterator[None]:
+def notifying(atlas: Atlas, listeners: Listeners) -> Iterator[None]:
     """Tell the listeners of a correction that a block of code has made, after it has ended without an error."""
-    before = Before.of(slam) if slam.listeners else None
+    before = atlas.copied() if listeners else None
     yield
     if before is not None:
-        tell(slam.listeners, correction_since(slam, before))
+        tell(listeners, [correction_since(before, atlas)])
 
 
-def tell(listeners: Listeners, correction: Correction | None) -> None:
-    """Call every function with a correction, if there is one."""
-    if correction is not None:
+def tell(listeners: Listeners, corrections: Iterable[Correction | None]) -> None:
+    """Call every function with each correction, if there is one."""
+    for correction in filter(None, corrections):
         for function in listeners:
             function(correction)
 
 
-def correction_since(slam: Observed, before: Before) -> Correction | None:
-    """Return which earlier frames have other poses than before, None if none has.
+def correction_since(old: Atlas, new: Atlas) -> Correction | None:
+    """Return which earlier frames have other poses than in a copy made before, None if none has.
 
     Poses are compared only if an anchor or a refined keyframe has changed: mapping moves the keyframes of the active
     submap a little at each keyframe, which is no correction.
     """
-    old, new = before.atlas, slam.atlas
     refined = new.refined.keys() != old.refined.keys()
     if not refined and np.array_equal(np.array(old.anchors), np.array(new.anchors)[: len(old.anchors)]):
         return None
-    earlier = new.places.first(before.steps)
+    earlier = new.places.first(len(old.places))
     T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
     frames = np.flatnonzero((T_before != T_now).any((1, 2)))
     if not len(frames):

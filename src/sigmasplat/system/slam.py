@@ -89,7 +89,7 @@ class Slam(MainLoop, ArrayInterface):
 
         Raises SourceError if the first frame has no depth or a later one comes from another camera.
         """
-        with notifying(self):
+        with notifying(self.atlas, self.listeners):
             return super().step(frame)
 
     def finish(self, progress: Progress = no_progress) -> None:
@@ -99,7 +99,7 @@ class Slam(MainLoop, ArrayInterface):
         the uncertainty is measured at; without both the total is 1. Does nothing when no rule cuts submaps and
         `final.iterations` is 0. Components that are not connected to the world are left out of the final map.
         """
-        with notifying(self):
+        with notifying(self.atlas, self.listeners):
             self._finish(progress)
 
     def _finish(self, progress: Progress) -> None:

@@ -77,9 +77,9 @@ class Tracker:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
-        params: rows [N, 17] of the map; prior: what is known of the pose apart from the images. should_stop: asked before each further guess; if it
-        returns True, that guess and the later ones are left out. A lost frame gets the best available guess (odometry,
-        else the last pose), and the motion is reset.
+        params: rows [N, 17] of the map; prior: what is known of the pose apart from the images. should_stop: asked
+        before each further guess; if it returns True, that guess and the later ones are left out. A lost frame gets the
+        best available guess (odometry, else the last pose), and the motion is reset.
         """
         seen.live = seen.live.noisier(self.statistics.noise)
         seen.move(self.motion.rate(), self.times)
