@@ -46,6 +46,7 @@ COMMANDS = {
     "eval": ("evaluate", "evaluate_run"),
     "mesh": ("mesh", "make_mesh"),
     "export": ("export", "export"),
+    "share": ("share", "share"),
     "download": ("download", "download"),
     "bench": ("batch", "bench"),
     "doctor": ("installation", "doctor"),

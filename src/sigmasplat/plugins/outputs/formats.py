@@ -137,6 +137,12 @@ def _plan(source: ExportSource, target: Path, *, cell_m: float, up: "Edge") -> s
     return f"{plan.area_m2(FREE):.1f} m² of free floor, also in {target.with_suffix('.json').name}"
 
 
+def _page(source: ExportSource, target: Path, *, up: "Edge") -> str:
+    from sigmasplat.plugins.outputs.share.page import export_page
+
+    return export_page(source.reader(), target, up)
+
+
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
     Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
@@ -145,5 +151,6 @@ PLUGIN = (
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap),
     Output("video", (".mp4",), "a video: colour, depth, uncertainty", _video),
     Output("plan", (".plan.png", ".png"), "a floor plan", _plan),
+    Output("html", (".html",), "one page for any browser, offline (sigmasplat share)", _page),
 )
 """The formats of this package. The first one is the default."""
