@@ -1,25 +1,18 @@
 """The viewer in a real browser (headless Chromium, software WebGL): screenshots of a finished run and of a live one."""
 
-import base64
-import io
 import json
-import os
-import shutil
 import signal
 import subprocess
 import sys
-import time
-import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import Image
 
+from headless_browser import CHROMIUM, PATIENCE_S, WIDTH, Page, Pixels, chromium, keep, wait_for
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.config.text import override
 from sigmasplat.plugins.outputs.drawing import colormap
@@ -30,48 +23,17 @@ from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium (apt-get install chromium)")
 
-WIDTH, HEIGHT, PANEL = 800, 600, 340
-"""Size of the window, and width of the panel on its right side."""
-FLAGS = [
-    "--headless=new", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--no-proxy-server",
-    "--remote-debugging-port=0", f"--window-size={WIDTH},{HEIGHT}",
-]  # fmt: skip
-PATIENCE_S = 120.0
+PANEL = 340
+"""Width of the panel on the right side of the window."""
 QUICK = {"input.width": "64", "mapping.first_iterations": "20", "mapping.iterations": "5", "submaps.distance_m": "0",
          "submaps.uncertainty_m": "0", "submaps.frames": "6", "loops.close": "no",
          "final.iterations": "5"}  # fmt: skip
-Pixels = NDArray[np.uint8]
 
 
-class Browser:
-    """A page in headless Chromium, controlled through the DevTools protocol."""
-
-    def __init__(self, process: subprocess.Popen[bytes], port: int) -> None:
-        from websockets.sync.client import connect
-
-        self.process, self.calls = process, 0
-        pages: list[dict[str, str]] = []
-        wait_for(lambda: pages.extend(p for p in _pages(port) if p["type"] == "page") or bool(pages))
-        self.socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=None)
-
-    def call(self, method: str, **params: Any) -> dict[str, Any]:
-        self.calls += 1
-        self.socket.send(json.dumps({"id": self.calls, "method": method, "params": params}))
-        while True:
-            answer = json.loads(self.socket.recv(timeout=PATIENCE_S))
-            if answer.get("id") == self.calls:
-                assert "error" not in answer, answer
-                return dict(answer["result"])
-
-    def screenshot(self) -> Pixels:
-        """Return the content of the window [H, W, 3]."""
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
+class Browser(Page):
+    """The viewer in headless Chromium."""
 
     def scene(self) -> Pixels:
         """Return the part beside the panel, without the notice about software WebGL at the top."""
@@ -80,49 +42,20 @@ class Browser:
     def text(self) -> str:
         """Return the text of the page."""
         words = "document.body ? document.body.innerText : ''"  # a newly opened page has no body yet
-        found = self.call("Runtime.evaluate", expression=words, returnByValue=True)
-        return str(found["result"]["value"])
+        return str(self.value(words))
 
     def choose(self, label: str, option: str) -> None:
         """Select an option of a dropdown, found by its label, with the mouse."""
         beside = f"[...document.querySelectorAll('label')].find(l => l.innerText.trim() == {json.dumps(label)})"
-        self._click(f"document.getElementById({beside}.htmlFor)")
+        self.click(f"document.getElementById({beside}.htmlFor)")
         spoken = "[...document.querySelectorAll('[role=option]')].find(o => o.offsetParent && o.innerText.trim() == "
-        wait_for(lambda: self._there(f"{spoken}{json.dumps(option)})"))
-        self._click(f"{spoken}{json.dumps(option)})")
-
-    def _there(self, expression: str) -> bool:
-        found = self.call("Runtime.evaluate", expression=f"!!{expression}", returnByValue=True)
-        return bool(found["result"].get("value"))  # no value if a part of the expression does not exist yet
-
-    def _click(self, expression: str) -> None:
-        wait_for(lambda: self._there(expression))
-        middle = f"(b => [b.x + b.width / 2, b.y + b.height / 2])(({expression}).getBoundingClientRect())"
-        x, y = self.call("Runtime.evaluate", expression=middle, returnByValue=True)["result"]["value"]
-        for kind in ("mousePressed", "mouseReleased"):
-            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-
-def _pages(port: int) -> list[dict[str, str]]:
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list", timeout=10) as answer:
-        return list(json.load(answer))
+        self.click(f"{spoken}{json.dumps(option)})")
 
 
 @contextmanager
 def browser(url: str, profile: Path) -> Iterator[Browser]:
-    """Open a page in a new Chromium process with an empty profile; end the process in any case."""
-    assert CHROMIUM is not None
-    process = subprocess.Popen(
-        [CHROMIUM, *FLAGS, f"--user-data-dir={profile}", url], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )  # fmt: skip
-    try:
-        told = profile / "DevToolsActivePort"
-        wait_for(lambda: told.is_file() and "\n" in told.read_text())
-        yield Browser(process, int(told.read_text().split()[0]))
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+    with chromium(url, profile) as port:
+        yield Browser(port)
 
 
 @contextmanager
@@ -142,13 +75,6 @@ def sigmasplat(*arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
         process.communicate()
 
 
-def wait_for(happened: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not happened():
-        assert time.monotonic() < deadline_s, "nothing happened"
-        time.sleep(0.3)
-
-
 def colours(pixels: Pixels) -> int:
     """Count the different colours, with eight levels per channel."""
     return len(np.unique((pixels // 32).reshape(-1, 3), axis=0))
@@ -161,12 +87,6 @@ def likeness(pixels: Pixels, map_colours: NDArray[np.float64]) -> float:
     lit = lit[lit.max(1) > 60]
     away = np.abs(lit[:, None] - ramp).max(2).min(1)
     return float((away < 24).mean()) if len(lit) else 0.0
-
-
-def keep(pixels: Pixels, name: str) -> None:
-    """Write a screenshot to the folder $SIGMASPLAT_SCREENSHOTS, if it is set, for a person to look at."""
-    if folder := os.environ.get("SIGMASPLAT_SCREENSHOTS"):
-        Image.fromarray(pixels).save(Path(folder) / f"{name}.png")
 
 
 @pytest.fixture(scope="module")
