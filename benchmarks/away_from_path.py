@@ -183,14 +183,15 @@ def spikes(field: GaussianField, camera: Camera, T_camera_world: Matrix, near_m:
 def sections(measured: dict[str, Any]) -> list[Section]:
     """Return a table with one row per checkout: means of the seeds."""
     runs = measured["figures"]["runs"]
+    shown = [column for column in COLUMNS if all(column[1] in run for run in runs)]  # older results have fewer
     rows = list[list[str]]()
     for code in dict.fromkeys(run["code"] for run in runs):
         of_code = [run for run in runs if run["code"] == code]
-        means = {key: float(np.mean([run[key] for run in of_code])) for _, key, _, _ in COLUMNS}
-        rows.append([code, *(f"{scale * means[key]:.{digits}f}" for _, key, digits, scale in COLUMNS)])
+        means = {key: float(np.mean([run[key] for run in of_code])) for _, key, _, _ in shown}
+        rows.append([code, *(f"{scale * means[key]:.{digits}f}" for _, key, digits, scale in shown)])
     seeds = len({run["seed"] for run in runs})
     note = f"Mean of {seeds} rooms, {measured['config']['views']} views each."
-    return [Section("Away from the path", ["code", *(head for head, _, _, _ in COLUMNS)], rows, note)]
+    return [Section("Away from the path", ["code", *(head for head, _, _, _ in shown)], rows, note)]
 
 
 def main(options: Options) -> int:
