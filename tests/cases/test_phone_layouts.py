@@ -118,7 +118,7 @@ def test_arkitscenes_without_path_depth_or_intrinsics(tmp_path: Path) -> None:
     (folder / "lowres_depth/41069021_306.608.png").unlink()
     assert len(open_source(folder)) == FRAMES - 1 and "306.608.png has no depth" in open_source(folder).skipped[0]
     shutil.rmtree(folder / "lowres_wide_intrinsics")
-    with pytest.raises(SourceError, match="no .pincam in lowres_wide_intrinsics; download both"):
+    with pytest.raises(SourceError, match=r"no \.pincam in lowres_wide_intrinsics; download both"):
         open_source(folder)
 
 
