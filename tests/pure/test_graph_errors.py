@@ -119,6 +119,18 @@ def with_keyframes(graph: SolvedGraph) -> tuple[Atlas, list[int]]:
     return atlas, keyframes
 
 
+def test_a_direction_that_an_edge_does_not_hold_is_no_failure() -> None:
+    """Information of a loop that was turned into another frame can be negative by rounding in such a direction."""
+    edges = measured(np.random.default_rng(3))
+    graph = solved(edges)
+    loose = graph.information.copy()
+    loose[-1] -= np.diag([0, 0, 0, 0, 0, 1.0]) * (loose[-1, 5, 5] + 1e-4)
+    error = GraphErrors(replace(graph, information=loose)).of(NODES - 1)
+    assert np.isfinite(error).all()
+    firm = GraphErrors(graph).of(NODES - 1)
+    assert np.trace(error @ error.T) == pytest.approx(np.trace(firm @ firm.T), rel=0.5)
+
+
 def test_a_frame_between_keyframes_shares_the_errors_of_both() -> None:
     graph = solved(measured(np.random.default_rng(2)))
     atlas, keyframes = with_keyframes(graph)

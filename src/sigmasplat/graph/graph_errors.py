@@ -51,8 +51,11 @@ class GraphErrors:
 
     @cached_property
     def _roots(self) -> Matrix:
-        """Return W [E, 6, 6] with W Wᵀ = the covariance of each edge."""
-        return np.swapaxes(np.linalg.inv(np.linalg.cholesky(self.graph.information)), 1, 2)
+        """Return W [E, 6, 6] with W Wᵀ = the covariance of each edge. Information below 1e-7 of the largest is raised
+        to it: it is the rounding error of an inverse, and can be negative."""
+        values, vectors = np.linalg.eigh(self.graph.information)
+        least = 1e-7 * values[:, -1:]
+        return np.asarray(vectors / np.sqrt(np.maximum(values, least))[:, None])
 
 
 def calibration_std(settings: InputConfig, camera: Camera) -> Matrix | None:
