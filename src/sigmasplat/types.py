@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -58,11 +57,9 @@ def never() -> bool:
     return False
 
 
-def unless(should_stop: ShouldStop, guesses: Iterable[Item], least: int = 0) -> Iterator[Item]:
-    """Yield guesses while `should_stop` returns False, at least the first `least` ones; a guess is not made before it
-    is asked."""
+def unless(should_stop: ShouldStop, guesses: Iterable[Item]) -> Iterator[Item]:
+    """Yield guesses while `should_stop` returns False; a guess is not made before it is asked."""
     waiting = iter(guesses)
-    yield from islice(waiting, least)
     while not should_stop():
         try:
             yield next(waiting)

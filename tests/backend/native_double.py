@@ -31,7 +31,7 @@ def _compiled() -> Any:
 
 
 def project_double(view: Array, means: Array, quats: Array, scales: Array, g: Array) -> tuple[Array, Array]:
-    """Project N splats; return footprints (u, v, z, conic, slopes) [N, 8] and gradients [N, 16] given those g."""
+    """Return the footprints (u, v, z, conic, slopes) [N, 8] of N splats, and gradients [N, 16] given those g [N, 8]."""
     footprint, gradient = np.empty((len(means), 8)), np.empty((len(means), 16))
     arrays = (np.ascontiguousarray(array, np.float64) for array in (view, means, quats, scales, g))
     kept = [*arrays, footprint, gradient]

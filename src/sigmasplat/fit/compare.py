@@ -16,10 +16,8 @@ from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
 from sigmasplat.native import _core
 from sigmasplat.types import Matrix
 
-LEVEL = 0
-"""Pyramid level that is compared: coarser ones have no depth where the sensor is noisy."""
 STEP = 4
-"""Every fourth row and column of that level is compared."""
+"""Every fourth row and column of the finest size is compared: coarser ones have no depth where the sensor is noisy."""
 NOISE_M = 0.002
 """Standard deviation of a depth reading at a distance of 0; a share of z² is added (`Pyramid.noise_per_m`)."""
 CLOSE_SIGMA, CLOSE_M = 3.0, 0.02
@@ -65,12 +63,11 @@ def compare(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comp
 
     Points of the reference that fall on live pixels of depth `HIDDEN_M` are left out.
     """
-    level = min(LEVEL, len(reference.cameras) - 1)
-    host, c, found = reference.kernels.to_host, reference.cameras[level], np.empty(8)
-    depth, gray = host(reference.depth[level]), host(reference.gray[level])
-    T, color_depth = np.ascontiguousarray(T_live_reference, np.float64), reference.color_depth(level)
+    host, c, found = reference.kernels.to_host, reference.cameras[0], np.empty(8)
+    depth, gray = host(reference.depth[0]), host(reference.gray[0])
+    T, color_depth = np.ascontiguousarray(T_live_reference, np.float64), reference.color_depth(0)
     if not _core.compare(
-        depth, gray, host(live.depth[level]), host(live.gray[level]), [c.fx, c.fy, c.cx, c.cy], T,
+        depth, gray, host(live.depth[0]), host(live.gray[0]), [c.fx, c.fy, c.cx, c.cy], T,
         _rules(HIDDEN_M, live.noise_per_m, live.scene_scale), found,
         None if color_depth is None else host(color_depth), readouts(reference.readout, live.readout),
     ):  # fmt: skip

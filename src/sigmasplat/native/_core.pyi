@@ -114,15 +114,7 @@ def align_images(
     sums: Array,
 ) -> tuple[int, int]: ...
 def mesh_depth(
-    u: Array,
-    v: Array,
-    z: Array,
-    faces: Array,
-    width: int,
-    height: int,
-    near_m: float,
-    depth: Array,
-    face: Array,
+    u: Array, v: Array, z: Array, faces: Array, width: int, height: int, near_m: float, depth: Array, face: Array
 ) -> None: ...
 def halve_color(color: Array, half: Array) -> None: ...
 def resize_depth(
@@ -194,14 +186,7 @@ class Level:
 
 class Harmonics:
     def __init__(
-        self,
-        params: Array,
-        moment1: Array,
-        moment2: Array,
-        last_step: Array,
-        degree: int,
-        step: int,
-        rate: float,
+        self, params: Array, moment1: Array, moment2: Array, last_step: Array, degree: int, step: int, rate: float
     ) -> None: ...
 
 class Rasteriser:

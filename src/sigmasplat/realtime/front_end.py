@@ -173,7 +173,7 @@ class FrontEnd:
             with timer.stage("track"), timer.kernels_of(view, "track_kernels"):
                 splats = NOTHING if self.snapshot is None else self.snapshot.params
                 seen = fitted_to_map(self.tracker, splats, view, seen)
-                fit = self.tracker.track(splats, view, seen, seen.frame.prior, should_stop)
+                fit = self.tracker.track(splats, view, seen, should_stop)
                 given += self.settled(self.tracker.motion, view)
             estimate = FrameEstimate.of(fit, self.tracker.lost)
             self.recovery.count(self.tracker.lost, self.tracker.doubtful > 0, seen)
@@ -212,7 +212,7 @@ class FrontEnd:
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
         """Start at the first frame, whose camera is the world until the map says otherwise."""
         refuse_first_without_depth(seen.frame, self.config)
-        self.tracker.start(seen, seen.frame.prior)
+        self.tracker.start(seen)
         self.offered, self.waits = 1, (0,)
         return FrameEstimate(np.eye(4), TRACKED, mapped=True)
 

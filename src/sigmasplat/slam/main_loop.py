@@ -113,7 +113,7 @@ class MainLoop(MappingBackend):
         """Start the first submap at the first frame. Its camera is the world, unless there are earlier submaps: then
         it is connected to the place where it is found, or begins a new component."""
         refuse_first_without_depth(seen.frame, self.config)
-        self.tracker.start(seen, seen.frame.prior)
+        self.tracker.start(seen)
         place = self.begin_first(seen)
         if place is None:
             return FrameEstimate(np.eye(4), TRACKED, mapped=True)
@@ -122,7 +122,7 @@ class MainLoop(MappingBackend):
     def _locate(self, seen: PreparedFrame) -> FrameEstimate:
         """Track a frame; if it is lost, search the whole map for it; if that fails too often, begin a new map."""
         with self._timer.stage("track"), self._timer.kernels_of(self.view, "track_kernels"):
-            fit = self.tracker.track(self.mapper.field.params, self.view, seen, seen.frame.prior)
+            fit = self.tracker.track(self.mapper.field.params, self.view, seen)
         if self.late is not None:
             fit.T_camera_world = fit.T_camera_world @ se3.inverse(self.settle_late(self.tracker.motion))
         lost, held_back = self.tracker.lost, self._is_held_back

@@ -79,8 +79,8 @@ def predict(previous: Matrix, velocity: Matrix, before: PosePrior, now: PosePrio
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """What all fits of one frame share: rows of the map [N, 17], its view, where the camera is expected, and whether to
-    stop."""
+    """What all fits of one frame share: the rows of the map [N, 17], its view, where the camera is expected, and
+    whether to stop."""
 
     params: Tensor
     view: View

@@ -21,7 +21,7 @@ def fitted_to_map(tracker: Tracker, params: Tensor, view: View, seen: PreparedFr
     frame without `tracking.fit_depth`. params: rows [N, 17] of the map."""
     if not tracker.config.fit_depth:
         return seen
-    T_world_camera = tracker.prediction(seen.frame.prior).predicted
+    T_world_camera = tracker.prediction(seen).predicted
     tracker.depth = _fitted(tracker.depth, params, view, seen, T_world_camera)
     return seen.with_depth(tracker.depth.applied(seen.frame.depth_m))
 

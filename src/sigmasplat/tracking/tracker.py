@@ -65,25 +65,22 @@ class Tracker:
         features = extractor if config.tracking.features else None
         return Tracker(config.tracking, features, detector=DynamicDetector(config.moving))
 
-    def start(self, seen: PreparedFrame, prior: PosePrior = NO_PRIOR) -> None:
+    def start(self, seen: PreparedFrame) -> None:
         """Fix the gauge: the first camera is the world."""
-        self.last_image, self.prior = seen.live, prior
+        self.last_image, self.prior = seen.live, seen.frame.prior
         self.motion = CameraMotion(seen.frame.timestamp_s)
 
-    def track(
-        self, params: Tensor, view: View, seen: PreparedFrame, prior: PosePrior = NO_PRIOR,
-        should_stop: ShouldStop = never,
-    ) -> PoseFit:  # fmt: skip
+    def track(self, params: Tensor, view: View, seen: PreparedFrame, should_stop: ShouldStop = never) -> PoseFit:
         """Estimate T_camera_world of a frame; `self.lost` then says whether tracking failed. A given pose is taken as
         it is, and judged by the images.
 
-        params: rows [N, 17] of the map; prior: what is known of the pose apart from the images. should_stop: asked
-        before each further guess; if it returns True, that guess and the later ones are left out. A lost frame gets the
-        best available guess (odometry, else the last pose), and the motion is reset.
+        params: rows [N, 17] of the map; should_stop: asked before each further guess; if it returns True, that guess
+        and the later ones are left out. A lost frame gets the best available guess (odometry, else the last pose), and
+        the motion is reset.
         """
         seen.live = seen.live.noisier(self.statistics.noise)
         seen.move(self.motion.rate(), self.times)
-        given, shown = Given(params, view, self.prediction(prior), should_stop), seen.shown
+        given, shown = Given(params, view, self.prediction(seen), should_stop), seen.shown
         predicted = given.prediction.predicted
         if given.prediction.given:
             best = self._fit(given, shown, predicted, patience=0)
@@ -93,7 +90,7 @@ class Tracker:
             best = self._estimated(given, seen, shown)
             self.lost = self._is_lost(best)
             self.doubtful = self.doubtful + 1 if self._doubts(best) else 0
-        self.prior = prior
+        self.prior = seen.frame.prior
         if self.lost:  # poses of earlier frames do not agree with later ones
             self.front, self.detector = None, self.detector.cleared()
         best.T_camera_world = se3.orthonormalise(best.T_camera_world)
@@ -193,9 +190,9 @@ class Tracker:
 
     # ---- guesses ----
 
-    def prediction(self, prior: PosePrior) -> PosePrediction:
+    def prediction(self, seen: PreparedFrame) -> PosePrediction:
         """Return where the camera of the next frame is expected."""
-        return predict(self.previous, self.motion.velocity, self.prior, prior)
+        return predict(self.previous, self.motion.velocity, self.prior, seen.frame.prior)
 
     def _fit(self, given: Given, seen: PreparedFrame, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
