@@ -96,8 +96,10 @@ def depth_from_array(depth: Array, depth_scale: float | None = None) -> NDArray[
         raise SourceError(f"{name}; give one image [H, W]: depth.squeeze() (a picture of depth in colours holds none)")
     if values.dtype.kind == "b" or values.dtype == np.uint8:
         raise SourceError(f"{name}; 8 bits hold no metric depth: give uint16 with depth_scale, or float metres")
-    if depth_scale is not None:
-        _check_scale(depth_scale)
+    is_number = isinstance(depth_scale, int | float | np.number)
+    if depth_scale is not None and not (is_number and 1 <= depth_scale < np.inf):
+        found = f"{depth_scale:g}" if is_number else described(depth_scale)
+        raise SourceError(f"depth_scale is {found}; give the units per metre, at least 1 (1000 for millimetres)")
     if values.dtype.kind == "f":
         return _float32(values if depth_scale is None else values / np.float64(depth_scale))
     if depth_scale is None:
@@ -164,13 +166,6 @@ def _array(name: str, values: Any) -> NDArray[Any]:
 def _float32(values: NDArray[Any]) -> NDArray[np.float32]:
     with np.errstate(over="ignore"):  # `Frame` refuses inf
         return np.array(values, np.float32, order="C")
-
-
-def _check_scale(depth_scale: float) -> None:
-    """Raise SourceError if `depth_scale` is not a number of units per metre."""
-    if not isinstance(depth_scale, int | float | np.number) or not 1 <= depth_scale < np.inf:
-        found = f"{depth_scale:g}" if isinstance(depth_scale, int | float | np.number) else described(depth_scale)
-        raise SourceError(f"depth_scale is {found}; give the units per metre, at least 1 (1000 for millimetres)")
 
 
 def _check_unit(frame: Frame, depth_scale: float | None) -> None:

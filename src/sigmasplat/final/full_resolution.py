@@ -62,12 +62,6 @@ def working_seconds(keyframes: KeyframeReader, final: FinalConfig) -> float:
     return final.seconds * WORKING_SHARE if shared else final.seconds
 
 
-def photo_view(keyframes: KeyframeReader, view: View, config: Config) -> View | None:
-    """Return a view like `view` for images as large as the largest photos; None without photos."""
-    cameras = _photo_cameras(keyframes)
-    return _like(view, max(cameras, key=lambda camera: camera.width), config, None) if cameras else None
-
-
 def _photo_cameras(keyframes: KeyframeReader) -> list[Camera]:
     """Return the cameras of the photos. A submap has photos of one camera."""
     found = [keyframes.store.picture(*place).photo for place in keyframes.places if place[1] == 0]
@@ -93,8 +87,9 @@ def refine_on_photos(
     it is short. Calls `progress(steps done, total)`.
     """
     final = config.final
-    if not final.width_iterations or clock.is_over or (large := photo_view(keyframes, view, config)) is None:
+    if not final.width_iterations or clock.is_over or not (cameras := _photo_cameras(keyframes)):
         return done, None
+    large = _like(view, max(cameras, key=lambda camera: camera.width), config, None)
     view = _like(view, view.camera, config, large.camera.fx)
     photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
     mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)

@@ -133,12 +133,14 @@ def refine(
     """
     final, mapping, losses, done = config.final, refinement(config), list[float](), 0
     clock = clock or Clock(final.seconds)
+    own_rates = final.lr_means_last or final.lr_log_scales or (final.lr_factor, final.lr_decay) != (1.0, 1.0)
     prune_by_weight(field, view, keyframes, final.prune_weight_px)
     while done < final.iterations and not clock.is_over:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
         degree = min(final.sh_degree, done // final.sh_every)
-        rates = decaying(mapping, final, done, clock, config.render.scene_scale) if _changes_rates(final) else None
+        changed = own_rates or final.beta2 != BETA2
+        rates = decaying(mapping, final, done, clock, config.render.scene_scale) if changed else None
         drawn = _draw(keyframes, steps, config, random, progress, clock, view)
         losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
         done += len(fitted)
@@ -186,12 +188,6 @@ class Clock:
     def next_stage(self, ends_s: float) -> "Clock":
         """Return the clock of the next stage, which begins now."""
         return replace(self, begins_s=min(self.spent_s, self.ends_s), ends_s=ends_s)
-
-
-def _changes_rates(final: FinalConfig) -> bool:
-    """Return whether the learning rates, or Adam's β₂, differ from those of mapping."""
-    own = final.lr_means_last or final.lr_log_scales
-    return bool(own) or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
 
 
 def decaying(

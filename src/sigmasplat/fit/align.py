@@ -86,11 +86,6 @@ class Alignment:
             bread @ n.S @ bread.T + (UNKNOWN_M * self.pair.reference.scene_scale) ** 2 * unknown @ unknown.T
         )
 
-    def moved_from(self, guess: Matrix) -> float:
-        """Return how far the image moved from a guess T_live_reference [4, 4]: a share of the depth, about an angle."""
-        T = self.T_live_reference @ se3.inverse(guess)
-        return math.hypot(float(np.linalg.norm(T[:3, 3])) / self.depth_m, se3.rotation_angle(T[:3, :3]))
-
     @property
     def bias(self) -> Matrix:
         """Return the standard deviation [6] of the systematic error that `covariance` does not contain, m and rad: the

@@ -5,11 +5,13 @@ afterwards, with the noise of the sensor as its unit. It also separates the two 
 in front may be new, but seeing through a known surface contradicts the pose.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sigmasplat.data import se3
 from sigmasplat.data.readout import readouts
 from sigmasplat.fit.align import Alignment, Pair, align, gray_share, normal_equations
 from sigmasplat.fit.pyramid import HIDDEN_M, NOISE_PER_M, Pyramid
@@ -89,8 +91,9 @@ def best_alignment(
     found = [align(*pair, T_live_reference, weight_color=weight) for pair in pairs]
     seen = [compare(reference, live, motion.T_live_reference) for motion in found]
     best = int(not near and agreement(seen[1]) > agreement(seen[0]) + UNDECIDED)
-    moved, holds = found[best].moved_from(T_live_reference), held(reference, live, found[best])
-    return found[best], replace(seen[best], moved=moved, held=holds)
+    T = found[best].T_live_reference @ se3.inverse(T_live_reference)
+    moved = math.hypot(float(np.linalg.norm(T[:3, 3])) / found[best].depth_m, se3.rotation_angle(T[:3, :3]))
+    return found[best], replace(seen[best], moved=moved, held=held(reference, live, found[best]))
 
 
 def held(reference: Pyramid, live: Pyramid, found: Alignment, weight_color: float = 0.5) -> float:

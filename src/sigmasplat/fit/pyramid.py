@@ -115,14 +115,13 @@ class Pyramid:
     def hiding(self, hidden: Any) -> "Pyramid":
         """Return the same images for comparisons and quick fits that leave out these pixels [H, W] of the finest size:
         each level has `HIDDEN_M` there."""
-        return replace(self, depth=[self._hidden(depth, hidden) for depth in self.depth], color_depths={})
-
-    def _hidden(self, depth: Plane, hidden: Any) -> Plane:
-        """Return the depth of a level with `HIDDEN_M` at these pixels of the finest size."""
-        host = self.kernels.to_host(depth)
-        step = len(hidden) // len(host)  # sizes halve, and drop an odd last row
-        coarse = hidden[::step, ::step][: host.shape[0], : host.shape[1]]
-        return self.kernels.beside(np.where(coarse, np.float32(HIDDEN_M), host), depth)
+        levels = []
+        for depth in self.depth:
+            host = self.kernels.to_host(depth)
+            step = len(hidden) // len(host)  # sizes halve, and drop an odd last row
+            coarse = hidden[::step, ::step][: host.shape[0], : host.shape[1]]
+            levels.append(self.kernels.beside(np.where(coarse, np.float32(HIDDEN_M), host), depth))
+        return replace(self, depth=levels, color_depths={})
 
     def with_depth(self, depth_m: Any) -> "Pyramid":
         """Return the same gray images with other depth [H, W], m, which is on the host."""

@@ -54,8 +54,10 @@ class Confidence:
 
 def off_probability(state: str, tracking: Mapping[str, float]) -> float:
     """Return the probability that the pose of a frame is off by more than 5 cm; tracking: values of its fit
-    (`FrameEstimate.logged`)."""
-    return CERTAIN[state] if state in CERTAIN else either(tracking.get("doubt", 0.0), hop_wrong(tracking))
+    (`FrameEstimate.logged`). Without a comparison, the fit is judged by its agreement."""
+    seen = compared(tracking)
+    wrong = 1.0 - tracking.get("agreement", 1.0) if seen is None else p_wrong(seen)
+    return CERTAIN[state] if state in CERTAIN else either(tracking.get("doubt", 0.0), wrong)
 
 
 def either(p: float, q: float) -> float:
@@ -95,9 +97,3 @@ def compared(tracking: Mapping[str, float]) -> Comparison | None:
     """Return the comparison of surfaces among the values of a fit, if it was made."""
     seen: dict[str, Any] = {name: tracking[name] for name in COMPARED if name in tracking}
     return Comparison(**seen) if "close" in seen else None
-
-
-def hop_wrong(tracking: Mapping[str, float]) -> float:
-    """Return the probability that the fit of a frame is wrong; without a comparison, by its agreement."""
-    seen = compared(tracking)
-    return 1.0 - tracking.get("agreement", 1.0) if seen is None else p_wrong(seen)

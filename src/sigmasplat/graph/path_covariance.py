@@ -223,8 +223,9 @@ class PathCovariance:
         A = se3.adjoint(self.anchors[submaps[0]])
         for number, G in zip(numbers, sensitivity.of(submaps.index(submap)), strict=True):
             edge = self.edges[number]
-            if self._is_chain(edge):
-                self._add_hops(error, A @ G, self._rows_of_hops(edge.a))
+            hops = self._rows_of_hops(edge.a)
+            if not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[hops.stop - 1]):
+                self._add_hops(error, A @ G, hops)  # to the last keyframe of its submap: the error is that of the hops
             else:
                 error[:, count + number] += A @ G @ root(edge.measured)
                 self._add_drift(error, A @ G, edge)
@@ -279,11 +280,6 @@ class PathCovariance:
         edges = [replace(e, a=node[e.a], b=node[e.b]) for e in (self.edges[i] for i in numbers)]
         poses = se3.inverse(self.anchors[submaps[:1]]) @ self.anchors[submaps]
         return submaps, numbers, Sensitivity(poses, edges) if edges else None
-
-    def _is_chain(self, edge: RelativePose) -> bool:
-        """Return whether an edge leads to the last keyframe of its submap: then its error is that of the hops."""
-        last = self._rows_of_hops(edge.a).stop - 1
-        return not edge.loop and np.array_equal(edge.T_a_b, self.T_submap_keyframe[last])
 
 
 # ---- the newest pose, while frames arrive ----

@@ -158,7 +158,10 @@ class Registrar:
             return self._recorded(own, keyframe)
         T_camera_own = se3.inverse(own.T_submap_camera[keyframe])
         self.view.forward(own.field.params.to(self.view.sums.device), T_camera_own)
-        return picture_images(self.view, rendered_picture(PoseMaps.of(self.view)), own.camera)
+        maps = PoseMaps.of(self.view)
+        depth_m = torch.where(maps.alpha > OPAQUE, maps.depth, 0.0)  # elsewhere there is no reading
+        color = (maps.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+        return picture_images(self.view, Picture(color.cpu().numpy(), depth_m.cpu().numpy()), own.camera)
 
     def _recorded(self, submap: Submap, keyframe: int) -> tuple[Target, Pyramid]:
         where = submap.index, keyframe
@@ -256,13 +259,6 @@ def drift_between(a: Submap, b: Submap, keyframes: tuple[int, int], T_a_b: Matri
     A, (in_a, in_b) = se3.adjoint(T_a_b), keyframes
     of_b = drift_to(in_b, b.T_submap_camera, scene_scale)
     return symmetric(drift_to(in_a, a.T_submap_camera, scene_scale) + A @ of_b @ A.T)
-
-
-def rendered_picture(maps: PoseMaps) -> Picture:
-    """Return the opaque part of a render as an image; elsewhere there is no reading."""
-    depth_m = torch.where(maps.alpha > OPAQUE, maps.depth, 0.0)
-    color = (maps.color.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-    return Picture(color.cpu().numpy(), depth_m.cpu().numpy())
 
 
 class LocalisationConfig(TrackingConfig):

@@ -61,7 +61,10 @@ def split(field: GaussianField, chosen: Tensor, random: np.random.Generator) -> 
     Everything except position and size is copied from the splat. Ids are new, and Adam's moments start at 0.
     """
     halves = copies(field, chosen.nonzero().squeeze(1).repeat_interleave(2))
-    _scatter(halves, random)
+    R = torch.from_numpy(se3.rotation_from_quaternion(halves.quats.cpu().numpy())).to(halves.params)
+    drawn = halves.scales * torch.from_numpy(random.standard_normal((len(halves), 3))).to(halves.params)
+    halves.params[:, MEANS] += (R * drawn[:, None, :]).sum(2)
+    halves.params[:, SCALES] -= float(np.log(CHILD_SCALE))
     field.keep(~chosen)
     field.append(halves)
 
@@ -93,14 +96,6 @@ def copies(field: GaussianField, rows: Tensor) -> GaussianField:
     """Return copies of rows with their attributes; Adam's moments start at 0."""
     attributes = {name: Rows(attribute.params[rows]) for name, attribute in field.attributes.items()}
     return GaussianField(field.params[rows], attributes=attributes)
-
-
-def _scatter(field: GaussianField, random: np.random.Generator) -> None:
-    """Move every splat to a point drawn from its own Gaussian, and make it smaller."""
-    R = torch.from_numpy(se3.rotation_from_quaternion(field.quats.cpu().numpy())).to(field.params)
-    drawn = field.scales * torch.from_numpy(random.standard_normal((len(field), 3))).to(field.params)
-    field.params[:, MEANS] += (R * drawn[:, None, :]).sum(2)
-    field.params[:, SCALES] -= float(np.log(CHILD_SCALE))
 
 
 def splat_uncertainty(field: GaussianField, view: View, keyframes: Sequence[Keyframe]) -> tuple[Tensor, Tensor]:

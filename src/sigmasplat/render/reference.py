@@ -268,7 +268,8 @@ class ReferenceView:
         g_leaf, g_twist, g_means2d = torch.autograd.grad(maps, leaves, gradients, materialize_grads=True)
         g_params.copy_(g_leaf)
         if grad2d is not None:
-            grad2d.copy_(grad2d_of(g_means2d, self.camera))
+            half_image = g_means2d.new_tensor([self.camera.width / 2, self.camera.height / 2])
+            grad2d.copy_((g_means2d * half_image).square().sum(1).sqrt())
         return np.asarray(g_twist.numpy(), np.float64)
 
     def backward_pose(self, params: Tensor) -> Matrix:
@@ -277,12 +278,6 @@ class ReferenceView:
 
     def visible(self, n: int) -> Tensor:
         return self._visible
-
-
-def grad2d_of(g_means2d: Tensor, camera: Camera) -> Tensor:
-    """Return the norm of image-mean gradients [N, 2] per px, converted to gradients per half image size, [N] (3DGS)."""
-    half_image = g_means2d.new_tensor([camera.width / 2, camera.height / 2])
-    return (g_means2d * half_image).square().sum(1).sqrt()
 
 
 def reaches(p: Projection, opacities: Tensor, camera: Camera, options: RenderConfig) -> Tensor:

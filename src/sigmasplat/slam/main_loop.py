@@ -35,7 +35,9 @@ class MainLoop(MappingBackend):
         self.late = found if found.reads_late else None
         if not estimate.mapped:
             self._offer_validation_view(seen, estimate)
-            self._run_pending()
+            completed(self.refining(self.mapper.pending_now))
+            with self._timer.stage("loops"):
+                completed(self.closing(SLICES_PER_FRAME))
         elif self.late is None or not self.steps:
             estimate.T_submap_camera = self._map(found)
             self.tracker.previous, self.tracker.lost = estimate.T_submap_camera, False
@@ -147,12 +149,6 @@ class MainLoop(MappingBackend):
     @property
     def _is_held_back(self) -> bool:
         return is_held_back(len(self.steps), self.config.input.hold_every)
-
-    def _run_pending(self) -> None:
-        """Make the steps that this frame does of the pending work: of the map, and of the search for loops."""
-        completed(self.refining(self.mapper.pending_now))
-        with self._timer.stage("loops"):
-            completed(self.closing(SLICES_PER_FRAME))
 
     def _offer_validation_view(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """Offer a frame as a validation view if it was tracked without doubt and is not held back."""

@@ -74,8 +74,9 @@ class OrientationGrid:
 
     def _histograms(self, image: Plane, valid: NDArray[np.bool_]) -> Matrix:
         """Return the histograms of all cells [rows · columns · bins], unit norm; zero if no gradient is known."""
-        magnitude, turn, known = _gradients(image, valid)
-        bin_ = turn * self.bins
+        dy, dx = np.gradient(2.0 * image.astype(np.float64))
+        known = binary_erosion(valid, NEIGHBOURS)  # where the gradient is known
+        magnitude, bin_ = np.hypot(dx, dy) * known, np.arctan2(dy, dx) / np.pi % 1.0 * self.bins
         lower = np.floor(bin_).astype(int)
         upper_share = bin_ - lower
         down, across = _tents(self.rows, image.shape[0]), _tents(self.columns, image.shape[1])
@@ -111,13 +112,6 @@ def _small_log_depth(depth_m: Plane) -> tuple[Plane, NDArray[np.bool_]]:
     mean = np.divide(total, share, where=valid, out=np.zeros_like(total))
     weight = gaussian_filter(valid.astype(np.float32), BLUR_PX)
     return np.divide(gaussian_filter(mean, BLUR_PX), weight, where=valid, out=np.zeros_like(mean)), valid
-
-
-def _gradients(image: Plane, valid: NDArray[np.bool_]) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
-    """Return the gradient's magnitude, its direction in half turns [0, 1), and which pixels have both."""
-    dy, dx = np.gradient(2.0 * image.astype(np.float64))
-    known = binary_erosion(valid, NEIGHBOURS)
-    return np.hypot(dx, dy) * known, np.arctan2(dy, dx) / np.pi % 1.0, known
 
 
 def _tents(cells: int, pixels: int) -> Matrix:
