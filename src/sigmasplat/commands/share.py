@@ -6,8 +6,8 @@ from typing import Annotated
 from sigmasplat.commands import options
 from sigmasplat.commands.export import ExportOptions, export
 from sigmasplat.commands.input_options import arg, flag
-
-FILM_S = 10.0
+from sigmasplat.commands.options import refuse_existing
+from sigmasplat.errors import ConfigError
 
 
 def share(
@@ -21,9 +21,12 @@ def share(
     example: sigmasplat share runs/kitchen-sigma --out kitchen.html
     """
     target = out or Path(run.resolve().name + ".html")
+    if target.suffix.lower() != ".html":
+        raise ConfigError(f"browsers do not open {target} as a page; give --out a name that ends in .html")
+    beside = target.with_suffix(".mp4")
+    refuse_existing(beside if film else None, overwrite)
     export(run, target, "html", overwrite, ExportOptions(up=up))
     print("open it in a browser, or send it: it needs no network")
     if film:
-        along = ExportOptions(seconds=FILM_S, panels="color")
-        export(run, target.with_suffix(".mp4"), "video", overwrite, along)
+        export(run, beside, "video", overwrite, ExportOptions(seconds=10.0, panels="color"))
     return 0

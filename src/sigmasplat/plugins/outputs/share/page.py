@@ -29,7 +29,6 @@ from sigmasplat.api import (
     RunError,
     SplatStd,
     SplatValues,
-    evenly_spread,
     harmonics,
     morton_order,
     se3,
@@ -50,10 +49,6 @@ MOST_BYTES = 5_000_000
 """Size of a page that mail and messengers carry."""
 SMALLEST_SCALE_M, SMALLEST_STD_M = 1e-4, 1e-5
 """Smaller values are raised to these: less than a pixel for anyone farther away than 10 cm."""
-MOST_POINTS = 2000
-"""Positions of the path in a page."""
-EARLIEST_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
-"""Times of frames below this do not count from 1970, so they do not tell the day."""
 HERE = Path(__file__).parent
 
 
@@ -77,7 +72,7 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
     T = transform_to("y-up", R_floor_world)
     values = SplatValues.of(flat.moved(torch.from_numpy(T)))
     data, scene = packed_within(values, std, shown.numpy(), most_bytes * 3 // 4 - 200_000)  # base64; all else
-    positions = np.stack(evenly_spread(list(path[:, :3, 3]), MOST_POINTS)) @ T[:3, :3].T
+    positions = path[:: len(path) // 2000 + 1, :3, 3] @ T[:3, :3].T
     ends = np.concatenate([np.quantile(values.means[shown.numpy()], [0.01, 0.99], axis=0), positions])
     margin = 0.1 * np.linalg.norm(np.ptp(ends, axis=0))  # how far beyond the visitor may step
     scene |= {
@@ -86,8 +81,10 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
         "width": reader.camera.width, "height": reader.camera.height, "focal": reader.camera.fx,
         "refined_fx": refined_fx(reader.config, Camera(**run.facts()["camera"])), "palette": INFERNO.tolist(),
     }  # fmt: skip
-    first_s = float(reader.valid_path().timestamps_s[0])
-    day = datetime.fromtimestamp(first_s if first_s > EARLIEST_S else (run.path / "run.json").stat().st_mtime, UTC)
+    time_s = float(reader.valid_path().timestamps_s[0])
+    if time_s < 1e9:  # September 2001: it does not count from 1970, so it does not tell the day
+        time_s = (run.path / "run.json").stat().st_mtime
+    day = datetime.fromtimestamp(time_s, UTC)
     subtitle = f"{day:%-d %B %Y} · {len(reader.frames):,} frames · made with SigmaSplat"
     write_text(target, page(run.path.resolve().name, subtitle, scene, data, poster))
     cut = len(values) - scene["count"]

@@ -61,10 +61,9 @@ void main() {
   gl_Position = vec4(pixel * vec2(2, -2) / size, 0, 1);
   colour = vec4(vec3(bytes(4).xyz) / 255.0, opacity);
   if (by_deviation) {
-    float value = (deviation.x + float(fine.w) * deviation.y - legend.x) / (legend.y - legend.x);
-    float place = clamp(value, 0.0, 1.0) * 8.0;
-    int stop = min(int(place), 7);
-    colour.rgb = mix(palette[stop], palette[stop + 1], place - float(stop));
+    float share = (deviation.x + float(fine.w) * deviation.y - legend.x) / (legend.y - legend.x);
+    float place = 8.0 * clamp(share, 0.0, 0.999);
+    colour.rgb = mix(palette[int(place)], palette[int(place) + 1], fract(place));
   }
 }`;
 const FRAGMENT = `#version 300 es
@@ -144,7 +143,6 @@ function sortAsAsked() {
 // ---- The camera: eye, yaw (0 looks along −z), pitch, distance of the point looked at, focal length in CSS px ----
 
 const cam = { eye: [0, 0, 0], yaw: 0, pitch: 0, distance: 2, focal: 500 };
-const lookedAt = (pose) => add(pose.eye, axesOf(pose)[2], pose.distance);
 const anglesOf = ([x, y, z]) => ({ yaw: Math.atan2(x, -z), pitch: Math.asin(clamp(y, -1, 1)) });
 const poseOf = (T) => ({ eye: [T[3], T[7], T[11]], ...anglesOf([T[2], T[6], T[10]]) }); // level, whatever T's roll
 
@@ -160,9 +158,10 @@ function place(changes) {
   changed = true;
 }
 
-function turned(pose, yaw, pitch) {
+function turned(pose, yaw, pitch) { // about the point looked at
   const after = { ...pose, yaw: pose.yaw + yaw, pitch: clamp(pose.pitch + pitch, -1.5, 1.5) };
-  return { ...after, eye: add(lookedAt(pose), axesOf(after)[2], -pose.distance) };
+  const center = add(pose.eye, axesOf(pose)[2], pose.distance);
+  return { ...after, eye: add(center, axesOf(after)[2], -pose.distance) };
 }
 
 function project(point) {
@@ -201,12 +200,17 @@ function pick(x, y) {
   return null;
 }
 
-// ---- Motion ----
+// ---- Motion, ruler and path ----
 
 let splats, draw, sorter, order = new Uint32Array(0), sorted = "", sorting = false;
 let flight = null, sway = null, changed = true, sharp = false, quality = 1, movedAt = 0, drawnAt = 0;
+let ends = [], lastTap = { at: 0, x: 0, y: 0 }, began = null, wheeledAt = 0;
 const held = new Set(), pointers = new Map();
+const say = (text) => Object.assign(byId("hint"), { textContent: text, hidden: !text });
 const wanted = () => `${axesOf(cam)[2]} ${shownCount()}`;
+
+// The field of view is between the whole image of a keyframe and a full window.
+const fit = () => place({ focal: scene.focal * Math.sqrt((innerWidth / scene.width) * (innerHeight / scene.height)) });
 
 function aim() { // turn about the surface in the middle, and come nearer to it
   const hit = pick(innerWidth / 2, innerHeight / 2);
@@ -224,23 +228,13 @@ function fly(to) {
   flight = { from: { ...cam }, to: { ...cam, ...to, yaw }, began: performance.now() };
 }
 
-function flyNear(point) { // half way, but no farther away than 1.2 m
-  const way = add(point, cam.eye, -1), length = Math.sqrt(dot(way, way)), distance = Math.min(length / 2, 1.2);
-  fly({ eye: add(point, way, -distance / length), ...anglesOf(way.map((x) => x / length)), distance });
-}
-
-function fit() { // between the whole image of a keyframe and a full window
-  cam.focal = scene.focal * Math.sqrt((innerWidth / scene.width) * (innerHeight / scene.height));
-  changed = true;
-}
-
 function step(now) {
   requestAnimationFrame(step);
   if (flight) {
     const t = clamp((now - flight.began) / FLIGHT_MS, 0, 1), k = t * t * (3 - 2 * t), { from, to } = flight;
     const between = (name) => from[name] + k * (to[name] - from[name]);
-    place({ eye: add(from.eye, add(to.eye, from.eye, -1), k), yaw: between("yaw"), pitch: between("pitch"),
-            distance: between("distance") });
+    const angles = { yaw: between("yaw"), pitch: between("pitch"), distance: between("distance") };
+    place({ eye: add(from.eye, add(to.eye, from.eye, -1), k), ...angles });
     if (t === 1) flight = null;
   } else if (sway) {
     const phase = (2 * Math.PI * (now - sway.began)) / SWAY_MS;
@@ -253,15 +247,12 @@ function step(now) {
   }
   if (changed) movedAt = now;
   const still = now - movedAt > 200;
-  if (changed || (still && !sharp)) redraw(now, still);
-}
-
-function redraw(now, still) {
+  if (!changed && (sharp || !still)) return;
   // A slow device draws fewer pixels while it moves, and all of them when it stands still.
   const took = now - drawnAt, most = Math.min(devicePixelRatio, 2);
   if (!still && took < 1000) quality = clamp(quality * (took > 45 ? 0.85 : took < 22 ? 1.05 : 1), 0.35, 1);
-  const scale = most * (still ? 1 : quality), width = Math.round(innerWidth * scale);
-  const height = Math.round(innerHeight * scale);
+  const scale = most * (still ? 1 : quality);
+  const [width, height] = [innerWidth, innerHeight].map((side) => Math.round(side * scale));
   if (view.width !== width || view.height !== height) Object.assign(view, { width, height });
   [changed, sharp, drawnAt] = [false, still, now];
   if (!sorting && wanted() !== sorted) {
@@ -272,14 +263,12 @@ function redraw(now, still) {
   drawOverlay(most);
 }
 
-// ---- Ruler and path ----
-
 const spoken = (m) => (m < 1 ? `${(100 * m).toFixed(1)} cm` : `${m.toFixed(2)} m`);
 
 // The two ends err independently. In which direction is unknown, so each error counts in full along the line.
 function measured([a, b]) {
   const way = add(a.point, b.point, -1), length = Math.sqrt(dot(way, way)), std = scene.std && Math.hypot(a.std, b.std);
-  return { length, std, text: spoken(length) + (std ? ` ± ${spoken(std)}` : "") };
+  return spoken(length) + (std ? ` ± ${spoken(std)}` : "");
 }
 
 function drawOverlay(scale) {
@@ -302,28 +291,23 @@ function drawOverlay(scale) {
 
 // ---- Hands ----
 
-let ends = [], lastTap = { at: 0, x: 0, y: 0 }, began = null, wheeledAt = 0;
-
-function say(text) {
-  byId("hint").textContent = text;
-  byId("hint").hidden = !text;
-}
-
 function tap(x, y, at) {
   const twice = at - lastTap.at < TAP_MS && Math.hypot(x - lastTap.x, y - lastTap.y) < 30;
   lastTap = { at: twice ? 0 : at, x, y };
   changed = true;
   if (pressed("measure")) {
     const hit = pick(x, y);
-    if (hit) ends = ends.length === 2 ? [hit] : [...ends, hit];
-    say(!hit ? "No surface there. Tap another point." : ends.length === 2 ? measured(ends).text : "Tap the other end.");
-    return;
+    if (!hit) return say("No surface there. Tap another point.");
+    ends = ends.length === 2 ? [hit] : [...ends, hit];
+    return say(ends.length === 2 ? measured(ends) : "Tap the other end.");
   }
   const near = ({ eye }) => (([px, py]) => Math.hypot(px - x, py - y) < 18)(project(eye) || [NaN, NaN]);
   const keyframe = pressed("path") && scene.keyframes.map(poseOf).find(near);
   const hit = twice && !keyframe && pick(x, y);
   if (keyframe) fly(keyframe);
-  else if (hit) flyNear(hit.point);
+  if (!hit) return;
+  const way = add(hit.point, cam.eye, -1), distance = Math.min(hit.distance / 2, 1.2); // half way, or to 1.2 m
+  fly({ eye: add(hit.point, way, -distance / hit.distance), ...anglesOf(way.map((x) => x / hit.distance)), distance });
 }
 
 function zoom(by) { // above 1: nearer
@@ -352,12 +336,6 @@ function drag(event) {
   else place(turned(cam, dx * 0.005, -dy * 0.005));
 }
 
-function lift(event) {
-  const alone = pointers.size === 1 && event.type === "pointerup" && event.button === 0;
-  pointers.delete(event.pointerId);
-  if (alone && !began.moved) tap(event.clientX, event.clientY, event.timeStamp);
-}
-
 function listen() {
   const on = (what, then, where = view) => where.addEventListener(what, then, { passive: false });
   on("contextmenu", (event) => event.preventDefault());
@@ -370,8 +348,12 @@ function listen() {
     aim();
   });
   on("pointermove", drag);
-  on("pointerup", lift);
-  on("pointercancel", lift);
+  on("pointercancel", (event) => pointers.delete(event.pointerId));
+  on("pointerup", (event) => {
+    const alone = pointers.size === 1 && event.button === 0;
+    pointers.delete(event.pointerId);
+    if (alone && !began.moved) tap(event.clientX, event.clientY, event.timeStamp);
+  });
   on("wheel", (event) => {
     event.preventDefault();
     touched();
@@ -394,7 +376,10 @@ function listen() {
   }, byId(id));
   toggle("uncertain", () => {});
   toggle("colour", (on) => (byId("legend").hidden = !on));
-  toggle("measure", (on) => say(on ? "Tap two points." : "", (ends = [])));
+  toggle("measure", (on) => {
+    ends = [];
+    say(on ? "Tap two points." : "");
+  });
   toggle("path", (on) => {
     say(on ? "Tap a dot to look from there." : "");
     // The camera stands on the path, which is behind it: it steps back as far as the map can bear.
@@ -446,8 +431,11 @@ async function begin() {
 
 // For tests and for the curious. T: T_world_camera, 16 numbers by rows; its roll is left out.
 window.sigmasplat = {
-  scene, cam, axesOf, pick, project, measured,
+  scene, cam, axesOf, pick, project,
   ready: () => sharp && !changed && !flight && sorted === wanted(),
-  setPose: (T) => touched(place(poseOf(T))),
+  setPose(T) {
+    touched();
+    place(poseOf(T));
+  },
 };
 begin();
