@@ -6,13 +6,16 @@ import sys
 import threading
 from typing import Any
 
+import numpy as np
 import viser
 
-from sigmasplat.api import GaussianField, SigmaSplatError
+from sigmasplat.api import GaussianField, Matrix, SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
 from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage, Legend
+from sigmasplat.plugins.viewer.motion import CameraSway
 from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
+from sigmasplat.plugins.viewer.ruler import Ruler, ShownMap
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 
@@ -41,8 +44,10 @@ class ViewerApp:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.server = server
-        self.panel = ControlPanel(server, self.changed, self._look_from)
+        self.ruler = Ruler(server, self._shown_map, self._show_length)
+        self.panel = ControlPanel(server, self.changed, self._look_from, self.ruler.start)
         self.scene = ViserScene(server, self._clicked)
+        self.sway = CameraSway(server, lambda: self.panel.floating.value and self.panel.state().layer is None)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
         self._unsure: tuple[list[GaussianField], Floats] = [], layers.sorted_uncertainties(())
@@ -64,7 +69,8 @@ class ViewerApp:
         self._wake.set()
 
     def stop(self) -> None:
-        """End the thread; the server keeps running."""
+        """End the threads; the server keeps running."""
+        self.sway.stop()
         self._stop.set()
         self._wake.set()
         self._thread.join()
@@ -95,22 +101,21 @@ class ViewerApp:
         pieces = snapshot.visible_pieces(controls.row)
         known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged_uncertainty`
         unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
-        self.panel.offer(known)
+        self.panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
         controls = self.panel.state()
-        ordered = self._uncertainties_of(pieces)
-        most = layers.largest_shown(ordered, controls.hidden_share)
-        span = layers.palette_range(ordered)
+        span = layers.palette_range(self._uncertainties_of(pieces))
+        self._open(snapshot)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
-            self._draw_splats(pieces, controls, span, most)
+            self._draw_splats(pieces, controls, span)
         self._draw_keyframes(snapshot, controls)
-        self._show_texts(snapshot, controls, pieces, most, unit)
+        self._show_texts(snapshot, controls, pieces)
         self._follow(snapshot, controls)
         legend = None
-        if controls.mode == "splats" and controls.colouring == "uncertainty":
+        if controls.mode == "splats" and controls.colouring == "how unsure":
             legend = Legend(INFERNO, *span, unit)
         for client in self.server.get_clients().values():
-            legend = self._draw_layer(client, snapshot, controls, pieces, most) or legend
+            legend = self._draw_layer(client, snapshot, controls, pieces) or legend
         if self._is_new("legend", legend and legend[1:]):
             self.panel.show_legend(None if legend is None else layers.draw_legend(legend))
 
@@ -129,10 +134,17 @@ class ViewerApp:
             self._unsure = fields, layers.sorted_uncertainties(pieces)
         return self._unsure[1]
 
+    def _open(self, snapshot: Snapshot) -> None:
+        """Choose the view of browsers that are opened from now on: the best one, or behind the newest camera."""
+        path, found = snapshot.path, np.flatnonzero(snapshot.path.inside)
+        if self._is_new("opening", path):
+            if snapshot.opening is not None:
+                self.scene.open_at(snapshot.opening)
+            elif len(found):
+                move_camera(self.server.initial_camera, path.T_world_camera[found[-1]], BACK_M, UP_M)
+
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
-        if self._is_new("initial camera", len(path) > 0) and len(path):
-            move_camera(self.server.initial_camera, path.T_world_camera[0], BACK_M, UP_M)
         if self._is_new("path", (path, row, controls.path)):
             self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
             self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
@@ -144,17 +156,15 @@ class ViewerApp:
             shown = truth if controls.true_path else None
             self.scene.show_lines("truth", None if shown is None else lines.truth_segments(shown))
 
-    def _draw_splats(
-        self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float], most: float
-    ) -> None:
+    def _draw_splats(self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float]) -> None:
         if controls.mode != "splats":
             pieces = ()
-        ends = None if controls.colouring == "colour" else span  # own colours do not depend on the range
-        state = ([(p.name, p.field) for p in pieces], controls.colouring, ends, most)
+        ends = None if controls.colouring == "their own" else span  # own colours do not depend on the range
+        state = ([(p.name, p.field) for p in pieces], controls.colouring, ends, controls.unsure)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
-            drawn = {p.name: (layers.splat_arrays(p, controls.colouring, span, most), p.T_world_piece) for p in sent}
-            self.scene.show_splats(drawn)
+            how = controls.colouring, span, controls.unsure
+            self.scene.show_splats({p.name: (layers.splat_arrays(p, *how), p.T_world_piece) for p in sent})
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
@@ -165,8 +175,7 @@ class ViewerApp:
             self.scene.show_keyframes(snapshot.camera, {row: path.T_world_camera[row] for row in rows})
 
     def _draw_layer(
-        self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...],
-        most: float,
+        self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...]
     ) -> Legend | None:  # fmt: skip
         """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
         key, c = ("layer", client.client_id), client.camera
@@ -174,21 +183,18 @@ class ViewerApp:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, splats = camera_pose(c), ([(p.field, p.T_world_piece.tobytes()) for p in pieces], most)
-        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, splats)
+        pose, (field, known, options, backend) = camera_pose(c), self._merge(snapshot, pieces, controls.unsure)
+        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, field)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
-            if self._merged[0] != splats:
-                self._merged = (splats, (layers.merge_pieces(pieces, most), layers.merged_uncertainty(pieces, most)))
             camera = layers.browser_camera(c.fov, c.aspect, rows)
-            (field, known), how = self._merged[1], (snapshot.options, snapshot.backend)
             made: LayerImage
             if controls.layer in PREDICTED_MODES and known is not None:
-                made = layers.render_predicted(field, known, camera, pose, controls.layer, *how)
+                made = layers.render_predicted(field, known, camera, pose, controls.layer, options, backend)
             else:
-                made = layers.render_layer(field, camera, pose, controls.layer, *how)
+                made = layers.render_layer(field, camera, pose, controls.layer, options, backend)
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
@@ -197,11 +203,32 @@ class ViewerApp:
         legend: Legend | None = drawn[1]
         return legend
 
-    def _show_texts(
-        self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...], most: float, unit: str
-    ) -> None:
+    def _merge(self, snapshot: Snapshot, pieces: tuple[Piece, ...], unsure: bool) -> ShownMap:
+        """Return the shown splats as one field, the same object until they change."""
+        splats = ([(p.field, p.T_world_piece.tobytes()) for p in pieces], unsure)
+        if self._merged[0] != splats:
+            merged = layers.merge_pieces(pieces, unsure), layers.merged_uncertainty(pieces, unsure)
+            self._merged = splats, ShownMap(*merged, snapshot.options, snapshot.backend)
+        shown: ShownMap = self._merged[1]
+        return shown
+
+    def _shown_map(self) -> ShownMap | None:
+        snapshot, controls = self._snapshot, self.panel.state()
+        if snapshot is None:
+            return None
+        return self._merge(snapshot, snapshot.visible_pieces(controls.row), controls.unsure)
+
+    def _show_length(self, points: list[Matrix], text: str) -> None:
+        """Draw the ruler between the points that were clicked so far, none to two."""
+        ends = np.array([[points[0], points[-1]]] if points else np.empty((0, 2, 3)), np.float32)
+        self.scene.show_lines("ruler", lines.Segments(ends, np.full(ends.shape, 255, np.uint8)))
+        self.scene.show_label(text if len(points) > 1 else "first point", points[-1] if points else None)
+        self.panel.length.content = text
+
+    def _show_texts(self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...]) -> None:
         path = snapshot.path
-        splats, kept = sum(len(p.field) for p in pieces), sum(int(layers.shown(p, most).sum()) for p in pieces)
+        splats = sum(len(p.field) for p in pieces)
+        kept = sum(int(layers.shown(p, controls.unsure).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         outside = int((~path.inside & ~path.lost).sum())
         apart = f", {outside} apart (not shown)" if outside else ""
@@ -211,9 +238,7 @@ class ViewerApp:
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        what = "error of depth" if unit else "σ"
         self.panel.facts.content, self.panel.frame.content = facts, _frame_text(snapshot, controls.row)
-        self.panel.hidden_text.content = f"hidden: {what} above {most:.3g}{unit}" if most < float("inf") else ""
 
     def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
         path = snapshot.path
@@ -223,8 +248,14 @@ class ViewerApp:
                     move_camera(client.camera, path.T_world_camera[-1], BACK_M, UP_M)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self.changed())
+        client.camera.on_update(lambda _: self._moved(client))
         self.changed()
+
+    def _moved(self, client: viser.ClientHandle) -> None:
+        if self.panel.floating.value and self.sway.moved_by_person(client):
+            self.panel.floating.value = False
+        if self.panel.state().layer is not None:  # the browser draws the rest
+            self.changed()
 
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot

@@ -26,7 +26,7 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["colour", "uncertainty"]
+Colouring = Literal["their own", "how unsure"]
 Floats = NDArray[np.float32]
 
 
@@ -54,9 +54,9 @@ class SplatArrays:
         return len(self.centers)
 
 
-def shown(piece: Piece, most: float) -> Tensor:
-    """Return which splats have an uncertainty of at most `most`, bool [N]; others are hidden."""
-    return uncertainties(piece) <= most
+def shown(piece: Piece, unsure: bool) -> Tensor:
+    """Return which splats are shown, bool [N]: the sure ones, or all if `unsure` or if it was not measured."""
+    return torch.ones(len(piece.field), dtype=torch.bool) if unsure or piece.sure is None else piece.sure
 
 
 def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
@@ -68,24 +68,16 @@ def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
     return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
 
 
-def largest_shown(ordered: Floats, hidden_share: float) -> float:
-    """Return the largest uncertainty that is shown if this share of the splats is hidden, the most uncertain ones, inf
-    if none is; `ordered` is sorted."""
-    if not hidden_share or not len(ordered):
-        return float("inf")
-    return float(np.quantile(ordered, max(1.0 - hidden_share, 0.0)))
-
-
 def palette_range(ordered: Floats) -> tuple[float, float]:
     """Return the range of values that the palette covers: from 0 to a high percentile."""
     return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
 
 
-def splat_arrays(piece: Piece, colouring: Colouring, span: tuple[float, float], most: float) -> SplatArrays:
+def splat_arrays(piece: Piece, colouring: Colouring, span: tuple[float, float], unsure: bool) -> SplatArrays:
     """Return the shown splats in their own colours, or coloured by uncertainty over the range `span`."""
-    mask = shown(piece, most)
+    mask = shown(piece, unsure)
     chosen = field_without_moments(piece.field.params[mask], {})
-    if colouring == "uncertainty":
+    if colouring == "how unsure":
         colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
@@ -100,26 +92,26 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
     return np.asarray(spread @ spread.transpose(0, 2, 1), np.float32)
 
 
-def merge_pieces(pieces: Sequence[Piece], most: float) -> GaussianField:
+def merge_pieces(pieces: Sequence[Piece], unsure: bool) -> GaussianField:
     """Return the shown splats of all pieces as one field in the world frame."""
-    parts = (piece.field.part(shown(piece, most)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
+    parts = (piece.field.part(shown(piece, unsure)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
     return GaussianField.side_by_side(parts)
 
 
-def merged_uncertainty(pieces: Sequence[Piece], most: float) -> MapUncertainty | None:
+def merged_uncertainty(pieces: Sequence[Piece], unsure: bool) -> MapUncertainty | None:
     """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
     known = pieces[0].uncertainty if len(pieces) == 1 else None
-    return None if known is None else known.at(shown(pieces[0], most))
+    return None if known is None else known.at(shown(pieces[0], unsure))
 
 
 MODES = {
-    "splats": "splats, drawn by the browser",
-    "colour": "colour, rendered by SigmaSplat",
-    "depth": "depth",
-    "V": "√V: standard deviation of colour",
-    "U": "√U: standard deviation of depth",
-    "color error": "predicted error of colour",
-    "depth error": "predicted error of depth",
+    "splats": "the map, quick to turn",
+    "colour": "the map, drawn exactly",
+    "depth": "distance from here",
+    "V": "spread of colours (√V)",
+    "U": "thickness of surfaces (√U)",
+    "color error": "expected error of colour",
+    "depth error": "expected error of distance",
 }
 """What the viewer can show, with its label: the splats, or a layer that SigmaSplat renders from the browser's
 viewpoint. A new one needs its branch in `render_layer`; lines and markers are in scene.py."""

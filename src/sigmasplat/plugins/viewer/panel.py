@@ -17,7 +17,7 @@ class ControlState:
 
     mode: str
     colouring: Colouring
-    hidden_share: float
+    unsure: bool
     row: int
     path: bool
     keyframes: bool
@@ -31,11 +31,13 @@ class ControlState:
 
 
 class ControlPanel:
-    """The controls. Calls `changed()` after each change, and `look_from(client)` after a click on "look from here"."""
+    """The controls. Calls `changed()` after each change, `look_from(client)` after a click on "go there", and
+    `measure()` after one on "measure a distance"."""
 
     def __init__(
-        self, server: viser.ViserServer, changed: Callable[[], None], look_from: Callable[[viser.ClientHandle], None]
-    ) -> None:
+        self, server: viser.ViserServer, changed: Callable[[], None],
+        look_from: Callable[[viser.ClientHandle], None], measure: Callable[[], None],
+    ) -> None:  # fmt: skip
         gui = server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(214, 90, 30))
         self.facts = gui.add_markdown("waiting for the first frame")
@@ -44,43 +46,50 @@ class ControlPanel:
         self._add_map_controls(gui)
         self._add_path_controls(gui)
         self.look.on_click(lambda event: look_from(event.client) if event.client else None)
+        self.measure.on_click(lambda _: measure())
         for control in (
-            self.mode, self.colouring, self.hidden, self.row, self.follow, self.path, self.keyframes, self.true_path,
+            self.mode, self.colouring, self.unsure, self.row, self.follow, self.path, self.keyframes, self.true_path,
         ):  # fmt: skip
             control.on_update(lambda _: changed())
 
     def _add_map_controls(self, gui: viser.GuiApi) -> None:
-        with gui.add_folder("Map"):
+        with gui.add_folder("Scene"):  # Any: mypy takes `value` for read-only
             self.mode: Any = gui.add_dropdown("show", _mode_options(predicted=False))
             self.colouring: Any = gui.add_dropdown(
-                "splat colour",
-                get_args(Colouring),
-                hint="the splats' own colours, or how unsure they are: bright = uncertain",
+                "colours", get_args(Colouring), hint="dark = the run is sure of this part, bright = unsure"
             )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
-            self.hidden = gui.add_slider(
-                "hide uncertain", 0, 99, 1, 0, hint="hide this percentage of the splats: the most uncertain ones"
+            self.unsure: Any = gui.add_checkbox(
+                "show what is uncertain", False, visible=False, hint="also show parts that may be in a wrong place"
             )
-            self.hidden_text = gui.add_markdown("")
+            self.floating: Any = gui.add_checkbox(
+                "float gently", False, visible=False, hint="sway around the scene; stops when you move the view"
+            )
+            self.measure = gui.add_button("measure a distance", hint="then click two points of the scene")
+            self.length = gui.add_markdown("")
 
     def _add_path_controls(self, gui: viser.GuiApi) -> None:
-        with gui.add_folder("Path", expand_by_default=False):  # Any: mypy takes `value` for read-only
-            self.row: Any = gui.add_slider("frame", 0, 1, 1, 1, hint="show the path and the submaps up to this frame")
-            self.frame = gui.add_markdown("")
-            self.look = gui.add_button("look from here")
-            self.follow = gui.add_checkbox("follow the camera", False, visible=False)
-            self.path = gui.add_checkbox("path", True)
-            self.keyframes = gui.add_checkbox(
-                "keyframes", False, hint="click a keyframe to move there and to see its image"
+        with gui.add_folder("Camera", expand_by_default=False):
+            self.row: Any = gui.add_slider(
+                "image", 0, 1, 1, 1, hint="an image of the recording: the yellow camera took it"
             )
-            self.true_path = gui.add_checkbox("ground truth", True, visible=False)
+            self.frame = gui.add_markdown("")
+            self.look = gui.add_button("go there", hint="look from where this image was taken")
+            self.follow: Any = gui.add_checkbox(
+                "follow the camera", False, visible=False, hint="stay behind the camera while it records"
+            )
+            self.path = gui.add_checkbox("its path", True, hint="red: where it did not know its position")
+            self.keyframes = gui.add_checkbox(
+                "images kept", False, hint="the map is made from these; click one to go there and see it"
+            )
+            self.true_path = gui.add_checkbox("its true path", True, visible=False, hint="blue: measured by others")
 
     def state(self) -> ControlState:
         """Return the current values of the controls."""
         return ControlState(
             next(mode for mode, label in MODES.items() if label == self.mode.value),
             self.colouring.value,
-            self.hidden.value / 100.0,
+            self.unsure.value,
             int(self.row.value),
             self.path.value,
             self.keyframes.value,
@@ -90,6 +99,8 @@ class ControlPanel:
 
     def adapt(self, frames: int, live: bool, truth_known: bool) -> None:
         """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
+        if not (self.follow.visible or self.floating.visible):  # the first one
+            self.floating.value = not live
         last = max(frames - 1, 1)
         at_end = self.row.value >= self.row.max
         if last != self.row.max:
@@ -98,10 +109,11 @@ class ControlPanel:
             self.row.max = last
             if at_end:
                 self.row.value = last
-        self.follow.visible, self.true_path.visible = live, truth_known
+        self.follow.visible, self.floating.visible, self.true_path.visible = live, not live, truth_known
 
-    def offer(self, known: bool) -> None:
-        """Offer to show predicted errors if the shown map has them (`known`)."""
+    def offer(self, known: bool, unsure: bool) -> None:
+        """Offer to show predicted errors if the shown map has them (`known`), and what is uncertain if a part is."""
+        self.unsure.visible = unsure
         options = _mode_options(known)
         if self.mode.options != options:
             self.mode.options = options

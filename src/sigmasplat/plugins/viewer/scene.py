@@ -9,10 +9,10 @@ import viser
 
 from sigmasplat.api import Camera, Matrix, se3
 from sigmasplat.plugins.viewer.layers import SplatArrays
-from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Segments
+from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Opening, Segments
 
 FRUSTUM_M = 0.08
-LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0}, 1.0, 0.03
+LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0, "ruler": 3.0}, 1.0, 0.03
 KEYFRAME_COLOUR, CURRENT_COLOUR = (112, 120, 130), (255, 210, 60)
 AHEAD_M = 1.0
 """Distance in front of a moved camera of the point that the mouse rotates it about."""
@@ -50,7 +50,7 @@ class ViserScene:
             if name in self._splats:
                 _place(self._splats[name], T)
 
-    def show_lines(self, name: Literal["path", "truth"], segments: Segments | None) -> None:
+    def show_lines(self, name: Literal["path", "truth", "ruler"], segments: Segments | None) -> None:
         """Show line segments under a name, or remove them if None."""
         if segments is None or not len(segments.points):
             self._drop(name)
@@ -62,6 +62,19 @@ class ViserScene:
             thickness=LINE_PX[name],
             thickness_units="screen",
         )
+
+    def show_label(self, text: str, position: Matrix | None) -> None:
+        """Show the ruler's text at a position [3], or remove it if None."""
+        self._drop("label")
+        if position is not None:
+            self._marks["label"] = self.server.scene.add_label("/label", text, position=position)
+
+    def open_at(self, opening: Opening) -> None:
+        """Let browsers that are opened later begin with a view; it says where up is, unless one is open already."""
+        if not self.server.get_clients():
+            self.server.scene.set_up_direction(opening.up)
+        self.server.initial_camera.fov = opening.fov
+        move_camera(self.server.initial_camera, opening.T_world_camera, ahead_m=opening.ahead_m)
 
     def show_lost(self, points: Floats) -> None:
         """Mark the positions [L, 3] of lost frames."""
@@ -113,11 +126,12 @@ class ViserScene:
 
 
 def move_camera(
-    camera: viser.CameraHandle | viser.InitialCameraConfig, T_world_camera: Matrix, back_m: float = 0, up_m: float = 0
-) -> None:
+    camera: viser.CameraHandle | viser.InitialCameraConfig, T_world_camera: Matrix, back_m: float = 0, up_m: float = 0,
+    ahead_m: float = AHEAD_M,
+) -> None:  # fmt: skip
     """Move a browser's camera, or that of pages opened later, to a pose, or to a position behind and above it."""
     camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
-    camera.look_at = (T_world_camera @ np.array([0.0, 0.0, AHEAD_M, 1.0]))[:3]
+    camera.look_at = (T_world_camera @ np.array([0.0, 0.0, ahead_m, 1.0]))[:3]
 
 
 def camera_pose(camera: viser.CameraHandle) -> Matrix:

@@ -27,13 +27,15 @@ class Piece:
     """A part of the map: splats in their own frame, and the pose T_world_piece of that frame.
 
     submap: its number, or None for the final map. If splats change, the piece gets a new field object; an unchanged
-    object means unchanged splats. uncertainty: how sure the splats are, None if it was not measured.
+    object means unchanged splats. uncertainty: how sure the splats are, sure: which are shown by default, bool [N];
+    None if it was not measured.
     """
 
     submap: int | None
     field: GaussianField
     T_world_piece: Matrix = dataclass_field(default_factory=lambda: np.eye(4))
     uncertainty: MapUncertainty | None = None
+    sure: Tensor | None = None
 
     @property
     def name(self) -> str:
@@ -48,8 +50,10 @@ class Piece:
 
     def thinned(self, most: int) -> "Piece":
         """Return a copy with at most `most` splats (`thin`)."""
-        known = None if self.uncertainty is None else self.uncertainty.at(thinned_rows(len(self.field), most))
-        return replace(self, field=thin(self.field, most), uncertainty=known)
+        rows = thinned_rows(len(self.field), most)
+        known = None if self.uncertainty is None else self.uncertainty.at(rows)
+        sure = None if self.sure is None else self.sure[rows]
+        return replace(self, field=thin(self.field, most), uncertainty=known, sure=sure)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,16 @@ class CameraPath:
         return len(self.T_world_camera)
 
 
+class Opening(NamedTuple):
+    """What a browser sees first: its camera's pose [4, 4], the distance m of the point that it looks at, its vertical
+    field of view (rad), and the unit vector [3] that points up."""
+
+    T_world_camera: Matrix
+    ahead_m: float
+    fov: float
+    up: Matrix
+
+
 EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())
 
 
@@ -85,7 +99,7 @@ class Snapshot:
 
     final: the final map, None before it is made; pieces: the submaps until then.
     true_positions [M, 3] m in the run's world, None unless an evaluation has stored them. image(row) returns the image
-    of the keyframe at a row of the path, or None if it was not kept.
+    of the keyframe at a row of the path, or None if it was not kept. opening: None unless the run has finished.
     """
 
     title: str
@@ -99,6 +113,7 @@ class Snapshot:
     backend: str = "auto"
     live: bool = False
     status: str = ""
+    opening: Opening | None = None
 
     def visible_pieces(self, row: int) -> tuple[Piece, ...]:
         """Return the final map if it exists, else the submaps started up to frame `row`."""

@@ -13,20 +13,29 @@ from sigmasplat.api import (
     TRUTH,
     Callback,
     Camera,
+    Config,
+    FieldRenderer,
+    GaussianField,
+    MapUncertainty,
     Matrix,
     RunFolder,
     RunFrames,
+    SigmaSplatError,
     SubmapStore,
+    Trajectory,
     outside_world,
     read_poses,
     states_at_end,
     submaps_outside,
 )
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
+from sigmasplat.plugins.outputs.first_look import VIEWS, best_view, sure
+from sigmasplat.plugins.outputs.floorplan.ground import Up, floor_frame, sample_surfaces, up_of
 from sigmasplat.plugins.viewer.snapshot import (
     BUDGET,
     DEFAULT_CAMERA,
     CameraPath,
+    Opening,
     Piece,
     Snapshot,
     field_without_moments,
@@ -51,18 +60,43 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
     config, true_file = run.config(), run.path / TRUTH
     cache = SubmapCache(run.submaps, budget)
     cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
+    camera = cache.camera or DEFAULT_CAMERA
+    piece = final_piece(splats, run.uncertainty_of(final), frames.path.T_world_camera)
     return Snapshot(
         run.path.resolve().name,
         _final_path(frames, tensors),
-        Piece(None, splats, uncertainty=run.uncertainty_of(final)),
+        piece,
         (),
         read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
-        cache.camera or DEFAULT_CAMERA,
+        camera,
         cache.image,
         config.render,
         config.backend,
         status=str(run.facts().get("status")),
+        opening=opening(piece, frames.path, camera, config, up_of(frames.path.T_world_camera, run.facts())),
     )
+
+
+def final_piece(splats: GaussianField, known: MapUncertainty | None, T_world_camera: Matrix) -> Piece:
+    """Return a final map as a piece; T_world_camera [F, 4, 4]: the poses that it was made from."""
+    std = None if known is None else known.std
+    mask = None if std is None else sure(splats, std, T_world_camera[:, :3, 3])
+    return Piece(None, splats, uncertainty=known, sure=mask)
+
+
+def opening(piece: Piece, path: Trajectory, camera: Camera, config: Config, up: Up) -> Opening | None:
+    """Return the view of the run that opens its map; None if it sees nothing from its path."""
+    field = piece.field if piece.sure is None else piece.field.part(piece.sure)
+    renderer = FieldRenderer(config.render, config.backend)
+    try:
+        samples = list(sample_surfaces(field, path, camera, renderer, VIEWS))
+        T_floor_world = floor_frame(samples, up)
+    except SigmaSplatError:
+        return None
+    T = path.T_world_camera[best_view(field, list(path.T_world_camera), camera, renderer)]
+    nearest = min(samples, key=lambda sample: float(np.abs(sample.T_world_camera - T).max()))
+    ahead_m = float(np.median((nearest.points - T[:3, 3]) @ T[:3, 2]))
+    return Opening(T, ahead_m, 2.0 * float(np.arctan(0.5 * camera.height / camera.fy)), T_floor_world[2, :3])
 
 
 class SubmapCache:
@@ -153,7 +187,8 @@ class LiveView(Callback):
         anchors = slam.atlas.anchors
         self._finished.load(anchors)
         placed = [replace(piece, T_world_piece=anchors[i].copy()) for i, piece in self._finished.pieces.items()]
-        final = Piece(None, slam.field, uncertainty=slam.uncertainty).thinned(self.budget) if finished else None
+        inside = poses[~(path.lost | ~path.inside)]
+        final = final_piece(slam.field, slam.uncertainty, inside).thinned(self.budget) if finished else None
         pieces = tuple(piece for piece in (*placed, *self._active()) if piece.submap not in outside)
         mapped = slam.mapper.keyframes
         return Snapshot(

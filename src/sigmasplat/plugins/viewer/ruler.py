@@ -1,0 +1,76 @@
+"""Measure the distance between two points that a person clicks in the scene."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import viser
+
+from sigmasplat.api import Camera, GaussianField, MapUncertainty, Matrix, RenderConfig, predict, render, se3
+from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA
+from sigmasplat.plugins.outputs.video import look_along
+
+PICKED = Camera(17, 17, 500.0, 500.0, 8.0, 8.0)
+"""Renders the surroundings of a clicked point, as sharp as an image 500 pixels wide."""
+
+
+class ShownMap(NamedTuple):
+    """The splats that are shown, in the world frame, how sure they are, and how they are rendered."""
+
+    field: GaussianField
+    known: MapUncertainty | None
+    options: RenderConfig
+    backend: str
+
+
+def point_on_ray(shown: ShownMap, origin: Matrix, direction: Matrix) -> tuple[Matrix, float] | None:
+    """Return where a ray [3], [3] meets the surface, D/A in m of the rendered depth where A > ½, and one standard
+    deviation (m, nan if not measured) of that depth; None where the map has no surface."""
+    forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    T_camera_world = se3.inverse(look_along(np.asarray(origin, np.float64), forward, np.roll(forward, 1) * [1, 1, -1]))
+    field, known, options, backend = shown
+    middle = PICKED.height // 2, PICKED.width // 2
+    with torch.inference_mode():
+        seen = render(field, PICKED, T_camera_world, None, options, backend)
+        if (alpha := float(seen.alpha[middle])) <= COVERED_ALPHA:
+            return None
+        std_m = float("nan")
+        if known is not None:
+            std_m = float(predict(field, known, PICKED, T_camera_world, options, backend).depth_std_m[middle])
+    return origin + forward * (float(seen.depth[middle]) / alpha), std_m
+
+
+class Ruler:
+    """Two clicks after `start` measure a distance; `show(points, text)` draws what is known so far."""
+
+    def __init__(
+        self, server: viser.ViserServer, shown: Callable[[], ShownMap | None], show: Callable[[list[Matrix], str], None]
+    ) -> None:
+        self.server, self.shown, self.show = server, shown, show
+        self._ends: list[tuple[Matrix, float]] = []
+
+    def start(self) -> None:
+        """Remove the last distance and wait for two clicks."""
+        self._ends = []
+        self.show([], "click the first point")
+        self.server.scene.remove_click_callback(self._clicked)
+        self.server.scene.on_click()(self._clicked)
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        shown = self.shown()
+        found = shown and point_on_ray(shown, np.array(event.ray_origin), np.array(event.ray_direction))
+        if found is not None:
+            self._ends.append(found)
+        points, text = [point for point, _ in self._ends], "click the second point"
+        if len(points) == 2:
+            self.server.scene.remove_click_callback(self._clicked)
+            text = length_text(*self._ends)
+        self.show(points, text if found else "no surface there: click another point")
+
+
+def length_text(first: tuple[Matrix, float], second: tuple[Matrix, float]) -> str:
+    """Return the distance between two points, ± one standard deviation at most: as if both errors lay along it."""
+    text = f"{np.linalg.norm(second[0] - first[0]):.3f} m"
+    std_m = float(np.hypot(first[1], second[1]))
+    return text if np.isnan(std_m) else f"{text} ± {100.0 * std_m:.1f} cm"
