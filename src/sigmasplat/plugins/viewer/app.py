@@ -16,7 +16,7 @@ from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage
 from sigmasplat.plugins.viewer.motion import CameraSway
 from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
 from sigmasplat.plugins.viewer.ruler import Ruler, ShownMap
-from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, move_camera
+from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, go_to_start, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 
 REST_S, LIVE_REST_S = 0.05, 0.5
@@ -61,7 +61,8 @@ class ViewerApp:
 
     def show(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; returns immediately."""
-        self._snapshot = snapshot
+        first, self._snapshot = self._snapshot is None, snapshot
+        self._open(snapshot, first)
         self.changed()
 
     def changed(self) -> None:
@@ -104,7 +105,6 @@ class ViewerApp:
         self.panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
         controls = self.panel.state()
         span = layers.palette_range(self._uncertainties_of(pieces))
-        self._open(snapshot)
         with self.server.atomic():
             self._draw_path(snapshot, controls)
             self._draw_splats(pieces, controls, span)
@@ -134,14 +134,15 @@ class ViewerApp:
             self._unsure = fields, layers.sorted_uncertainties(pieces)
         return self._unsure[1]
 
-    def _open(self, snapshot: Snapshot) -> None:
+    def _open(self, snapshot: Snapshot, first: bool) -> None:
         """Choose the view of browsers that are opened from now on: the best one, or behind the newest camera."""
-        path, found = snapshot.path, np.flatnonzero(snapshot.path.inside)
-        if self._is_new("opening", path):
-            if snapshot.opening is not None:
-                self.scene.open_at(snapshot.opening)
-            elif len(found):
-                move_camera(self.server.initial_camera, path.T_world_camera[found[-1]], BACK_M, UP_M)
+        inside = snapshot.path.T_world_camera[snapshot.path.inside]
+        if snapshot.opening is not None:
+            self.scene.open_at(snapshot.opening, first)
+        elif len(inside):
+            move_camera(self.server.initial_camera, inside[-1], BACK_M, UP_M)
+        for client in self.server.get_clients().values() if first else ():
+            go_to_start(client, self.server.initial_camera)
 
     def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
         path, row = snapshot.path, controls.row
@@ -222,7 +223,7 @@ class ViewerApp:
         """Draw the ruler between the points that were clicked so far, none to two."""
         ends = np.array([[points[0], points[-1]]] if points else np.empty((0, 2, 3)), np.float32)
         self.scene.show_lines("ruler", lines.Segments(ends, np.full(ends.shape, 255, np.uint8)))
-        self.scene.show_label(text if len(points) > 1 else "first point", points[-1] if points else None)
+        self.scene.show_label(text if len(points) > 1 else "first point", np.mean(points, axis=0) if points else None)
         self.panel.length.content = text
 
     def _show_texts(self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...]) -> None:
@@ -249,6 +250,8 @@ class ViewerApp:
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self._moved(client))
+        if self._snapshot is not None:
+            go_to_start(client, self.server.initial_camera)
         self.changed()
 
     def _moved(self, client: viser.ClientHandle) -> None:

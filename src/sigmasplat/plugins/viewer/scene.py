@@ -69,9 +69,9 @@ class ViserScene:
         if position is not None:
             self._marks["label"] = self.server.scene.add_label("/label", text, position=position)
 
-    def open_at(self, opening: Opening) -> None:
-        """Let browsers that are opened later begin with a view; it says where up is, unless one is open already."""
-        if not self.server.get_clients():
+    def open_at(self, opening: Opening, first: bool) -> None:
+        """Let browsers that are opened later begin with a view; the first one says where up is."""
+        if first:
             self.server.scene.set_up_direction(opening.up)
         self.server.initial_camera.fov = opening.fov
         move_camera(self.server.initial_camera, opening.T_world_camera, ahead_m=opening.ahead_m)
@@ -132,6 +132,12 @@ def move_camera(
     """Move a browser's camera, or that of pages opened later, to a pose, or to a position behind and above it."""
     camera.position = (T_world_camera @ np.array([0.0, -up_m, -back_m, 1.0]))[:3]
     camera.look_at = (T_world_camera @ np.array([0.0, 0.0, ahead_m, 1.0]))[:3]
+
+
+def go_to_start(client: viser.ClientHandle, start: viser.InitialCameraConfig) -> None:
+    """Move a browser to where it should have opened: it may have reported another camera before it knew."""
+    with client.atomic():
+        client.camera.fov, client.camera.position, client.camera.look_at = start.fov, start.position, start.look_at
 
 
 def camera_pose(camera: viser.CameraHandle) -> Matrix:
