@@ -21,16 +21,14 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.view_scores import scored_view
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.plugins.outputs.video import orbit_view
+from sigmasplat.plugins.outputs.video import Film, orbit_view
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 DIRECTIONS = 36
-"""Steps of a full turn around the map, from which the last panel's view is chosen."""
-ZOOM = 1.2
-"""Of the last panel: `orbit_view` leaves a wide margin."""
+"""Steps of the orbit around the map, from which the last panel's view is chosen."""
 Run = Annotated[Path, tyro.conf.Positional, arg(help="folder of a finished run")]
 Index = Annotated[int, arg(help="frame of the first three panels")]
 Direction = Annotated[int, arg(help=f"direction of the last panel, 0 to {DIRECTIONS - 1}")]
@@ -46,9 +44,8 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     T_camera_world = se3.inverse(reader.poses_of([index]).T_world_camera[0])
     with torch.inference_mode():
         view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
-        below, poses = orbit_view(field, reader.valid_path(), frame.camera, DIRECTIONS, renderer)
-        near = replace(frame.camera, fx=ZOOM * frame.camera.fx, fy=ZOOM * frame.camera.fy)
-        above = renderer(below, near, se3.inverse(poses[direction % DIRECTIONS]))
+        film, poses = orbit_view(Film.of(reader, frame.camera, renderer), reader.valid_path(), DIRECTIONS)
+        above = film.seen(poses[direction % DIRECTIONS])
     backdrop = np.array(BACKGROUND, np.float32) / 255.0
     seen = above.color.numpy() + (1.0 - above.alpha.numpy()[..., None]) * backdrop
     pixels = (np.clip(seen, 0.0, 1.0) * 255.0).round().astype(np.uint8)

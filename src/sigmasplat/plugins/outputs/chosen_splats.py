@@ -1,10 +1,12 @@
 """Write the splats of a run or of a map file that are within bounds, in given axes."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sigmasplat.api import ConfigError, GaussianField, Matrix, RunError, SigmaSplatError, SplatStd
 from sigmasplat.plugins.outputs.axes import AXES, Axes, Edge, levelled, transform_to
@@ -40,23 +42,32 @@ def write_splats(
     field, std = source.splats()
     total = len(field)
     if std_below_m is not None:
-        if std is None:
-            raise ConfigError(
-                f"{source.path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with "
-                "uncertainty.json (run older runs again)"
-            )
-        kept = std.depth_std_m < std_below_m
-        if total and not kept.any():
-            median = f"{std.depth_std_m.median():.3g} m"
-            raise RunError(f"no splat of {source.path} is left (median depth_std_m is {median}); use a weaker bound")
+        kept = kept_below(source.path, std, std_below_m)
         field.keep(kept.to(field.params.device))
-        std = std.at(kept.cpu())
+        std = std and std.at(kept.cpu())
     T, note = _transform(source, axes, own, up)
     field = field if np.array_equal(T, np.eye(4)) else field.moved(torch.from_numpy(T))
     print(f"writing {len(field):,} splats …", flush=True)
     write(field, std)
     dropped = "" if std_below_m is None else f"; dropped {total - len(field):,} of {total:,}"
     return f"{len(field):,} splats, axes {axes}{note}{dropped}"
+
+
+def kept_below(path: Path, std: SplatStd | None, std_below_m: float) -> Tensor:
+    """Return which splats of a run or map at `path` have a standard deviation of depth below a bound, bool [N].
+
+    Raises ConfigError if it is not known, RunError if no splat has.
+    """
+    if std is None:
+        raise ConfigError(
+            f"{path} has no calibrated uncertainty, so --std-below-m cannot be used; give a run with "
+            "uncertainty.json (run older runs again)"
+        )
+    kept = std.depth_std_m < std_below_m
+    if len(kept) and not kept.any():
+        median = f"{std.depth_std_m.median():.3g} m"
+        raise RunError(f"no splat of {path} is left (median depth_std_m is {median}); use a weaker bound")
+    return kept
 
 
 def _transform(source: "ExportSource", axes: Axes, own: Axes, up: Edge) -> tuple[Matrix, str]:

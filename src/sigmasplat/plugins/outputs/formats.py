@@ -114,7 +114,7 @@ def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
 
 def _video(
     source: ExportSource, target: Path, *, size: int, fps: float, seconds: float | None, path: str, panels: str,
-    up: "Edge",
+    up: "Edge", std_below_m: float | None, uncertain: bool,
 ) -> str:  # fmt: skip
     from sigmasplat.api import Screen
     from sigmasplat.plugins.outputs.video import export_video
@@ -122,7 +122,7 @@ def _video(
     with Screen().counting("film") as progress:
         count = export_video(
             source.reader(), target, width_px=size, fps=fps, seconds=seconds, orbit=path == "orbit",
-            panels=panels == "all", up=up, progress=progress,
+            panels=panels == "all", up=up, std_below_m=std_below_m, uncertain=uncertain, progress=progress,
         )  # fmt: skip
     return f"{count:,} images, {count / fps:.1f} s"
 

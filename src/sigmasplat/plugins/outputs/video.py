@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
+from torch import Tensor
 
 from sigmasplat.api import (
     Camera,
@@ -17,6 +18,7 @@ from sigmasplat.api import (
     GaussianField,
     Matrix,
     Progress,
+    Render,
     RunError,
     SigmaSplatError,
     Trajectory,
@@ -26,16 +28,22 @@ from sigmasplat.api import (
     se3,
 )
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer
+from sigmasplat.plugins.outputs.chosen_splats import kept_below
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
+from sigmasplat.plugins.outputs.first_look import sure
 from sigmasplat.plugins.outputs.floorplan.ground import Edge, Floats, Up, floor_frame, sample_surfaces, up_of
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 SMOOTHING_S = 0.25
 """Standard deviation of the Gaussian that removes camera shake."""
 FINE_HZ = 120.0
-ORBIT_ELEVATION_RAD = np.deg2rad(50.0)
+ORBIT_ELEVATIONS_RAD = np.deg2rad([25.0, 40.0, 55.0])
+DIRECTIONS, WIDTH_PX, POINTS = 24, 96, 4000
+"""An orbit is chosen by images so wide from so many directions; its radius by so many points of surfaces."""
+ENOUGH = 0.75
+"""The share of the surfaces that an orbit shows, and of the best direction's covered pixels that each other one has."""
 
 
 def smooth_path(trajectory: Trajectory, images: int, smoothing_s: float = SMOOTHING_S) -> Matrix:
@@ -67,17 +75,16 @@ def smooth_path(trajectory: Trajectory, images: int, smoothing_s: float = SMOOTH
 
 
 def orbit(
-    center: Matrix, up: Matrix, start: Matrix, radius_m: float, images: int, elevation_rad: float = ORBIT_ELEVATION_RAD
+    center: Matrix, up: Matrix, start: Matrix, radius_m: float, angles_rad: Matrix, elevation_rad: float
 ) -> Matrix:
-    """Return T_world_camera [images, 4, 4] of one circle around a point, looking down at it from `radius_m` away.
+    """Return T_world_camera [N, 4, 4] on a circle around a point, looking down at it from `radius_m` away.
 
-    up: unit vector; start: horizontal direction in which the first image looks. The last image is one step before the
-    first one.
+    up: unit vector; start: horizontal direction in which an image looks at the first of the angles [N], if that is 0.
     """
     ahead = start - (start @ up) * up
     ahead /= np.linalg.norm(ahead)
     sideways = np.cross(ahead, up)
-    angle = 2.0 * np.pi * np.arange(images)[:, None] / images
+    angle = angles_rad[:, None]
     outward = -(np.cos(angle) * ahead + np.sin(angle) * sideways)
     outward = np.cos(elevation_rad) * outward + np.sin(elevation_rad) * up
     return np.stack([look_along(center + radius_m * out, -out, up) for out in outward])
@@ -108,26 +115,24 @@ def image_count(path_s: float, fps: float = 25.0, seconds: float | None = None, 
 
 def export_video(
     reader: RunReader, target: Path, *, width_px: int = 0, fps: float = 25.0, seconds: float | None = None,
-    orbit: bool = False, panels: bool = True, up: Edge = "auto", renderer: Renderer | None = None,
-    progress: Progress = no_progress,
+    orbit: bool = False, panels: bool = True, up: Edge = "auto", std_below_m: float | None = None,
+    uncertain: bool = False, renderer: Renderer | None = None, progress: Progress = no_progress,
 ) -> int:  # fmt: skip
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
     width_px: width of a panel (0: that of the run's images); orbit: not along the run's path; panels: depth and
-    uncertainty beside colour; up: at this edge of the images, for an orbit. Raises RunError on an unknown ending, or
-    without a map or path.
+    uncertainty beside colour; up: at this edge of the images, for an orbit; std_below_m: as of `kept_below`, else the
+    splats that are not `sure` are hidden, unless `uncertain`. Raises RunError on an unknown ending, or without a map or
+    path.
     """
     config, path = reader.config, reader.valid_path()
     renderer = renderer or FieldRenderer(config.render, config.backend)
-    field, camera = reader.run.read_map(), film_camera(reader.camera, width_px)
+    film = Film.of(reader, film_camera(reader.camera, width_px), renderer, std_below_m, uncertain)
     count = image_count(float(path.timestamps_s[-1] - path.timestamps_s[0]), fps, seconds, orbit)
     if orbit:
-        field, poses = orbit_view(
-            field, path, camera, count, renderer, up_of(path.T_world_camera, reader.run.facts(), up)
-        )
+        film, poses = orbit_view(film, path, count, up_of(path.T_world_camera, reader.run.facts(), up))
     else:
-        poses = smooth_path(path, count)
-    film = Film(field, camera, renderer)
+        film, poses = replace(film, seen_from=None), smooth_path(path, count)
     progress(0, count)
     write_video(target, film.images(poses, panels, progress), fps)
     return count
@@ -135,11 +140,40 @@ def export_video(
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A map, and how it is filmed: its camera and its renderer."""
+    """A map, and how it is filmed: its camera and its renderer.
+
+    seen_from: the mean directions [N, 3] that each splat was seen from; from behind it is hidden. None, [N, 0]: never.
+    """
 
     field: GaussianField
     camera: Camera
     renderer: Renderer
+    seen_from: Tensor | None = None
+
+    @classmethod
+    def of(
+        cls, reader: RunReader, camera: Camera, renderer: Renderer, std_below_m: float | None = None,
+        uncertain: bool = False,
+    ) -> "Film":  # fmt: skip
+        """Return a film of a run, as described in `export_video`."""
+        field = reader.run.read_map()
+        known = reader.run.uncertainty_of(field)
+        std = None if known is None else known.std
+        if std_below_m is not None:
+            kept = kept_below(reader.run.path, std, std_below_m)
+        else:
+            kept = sure(field, None if uncertain else std, reader.valid_path().T_world_camera[:, :3, 3])
+        seen_from = None if known is None or uncertain else known.splats[kept][:, 3:]
+        return cls(field.part(kept), camera, renderer, seen_from)
+
+    def seen(self, T_world_camera: Matrix) -> Render:
+        """Render the map from a pose [4, 4]."""
+        field = self.field
+        if self.seen_from is not None and self.seen_from.shape[1]:
+            toward = torch.from_numpy(T_world_camera[:3, 3]).to(field.means) - field.means
+            field = field.part((self.seen_from.to(toward) * toward).sum(1) >= 0.0)
+        with torch.inference_mode():
+            return self.renderer(field, self.camera, se3.inverse(T_world_camera))
 
     def images(self, poses: Matrix, panels: bool, progress: Progress = no_progress) -> Iterator[Rgb]:
         """Yield an image for each pose [N, 4, 4]: colour, in `panels` with depth and √V beside it."""
@@ -165,8 +199,7 @@ class Film:
     def _maps(self, T_world_camera: Matrix) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
         """Return colour [H, W, 3] in [0, 1], depth Σwz / Σw in m, √V of the mean over the channels, and where there is
         a surface."""
-        with torch.inference_mode():
-            seen = self.renderer(self.field, self.camera, se3.inverse(T_world_camera))
+        seen = self.seen(T_world_camera)
         alpha = seen.alpha.cpu()
         maps = (
             seen.color.cpu().clamp(0.0, 1.0),
@@ -183,24 +216,59 @@ def film_camera(camera: Camera, width_px: int) -> Camera:
     return camera.resized(width, max(2, round(camera.height * width / camera.width / 2) * 2))
 
 
-def orbit_view(
-    field: GaussianField, path: Trajectory, camera: Camera, images: int, renderer: Renderer, up: Up | None = None,
-) -> tuple[GaussianField, Matrix]:  # fmt: skip
-    """Return the map without its ceiling, and poses [images, 4, 4] on a circle above it from which it is visible;
-    up: as in `floor_frame`."""
-    samples = list(sample_surfaces(field, path, camera, renderer, SURFACE_VIEWS))
+def orbit_view(film: Film, path: Trajectory, images: int, up: Up | None = None) -> tuple[Film, Matrix]:
+    """Return a film without the ceiling, and poses [images, 4, 4] around what its path has seen; up: as in
+    `floor_frame`.
+
+    They are so far away that `ENOUGH` of the surfaces are in the image, and at the elevation where the map covers most.
+    Where it covers too little from some directions, the camera swings to and fro between the others.
+    """
+    samples = list(sample_surfaces(film.field, path, film.camera, film.renderer, SURFACE_VIEWS))
     T = floor_frame(samples, up)
-    points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
-    low, high = np.quantile(points, [0.02, 0.98], axis=0)
     ceiling_m = float(np.median(path.T_world_camera[:, :3, 3] @ T[2, :3] + T[2, 3])) + CEILING_M
-    middle = np.append((low + high)[:2] / 2.0, min(ceiling_m, 0.8) / 2.0)
-    half_view = np.arctan(min(camera.width / camera.fx, camera.height / camera.fy) / 2.0)
-    radius_m = 0.85 * float(np.linalg.norm((high - low)[:2]) / 2.0 / np.sin(half_view))
-    T_world_floor = se3.inverse(T)
-    center = T_world_floor[:3, :3] @ middle + T_world_floor[:3, 3]
-    kept = field.moved(torch.eye(4))  # makes a copy
-    kept.keep(torch.from_numpy(field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m))
-    return kept, orbit(center, T[2, :3], T[1, :3], radius_m, images)
+    points = np.concatenate([sample.points for sample in samples]) @ T[:3, :3].T + T[:3, 3]
+    points = points[(points[:, 2] < ceiling_m) | (points[:, 2].min() >= ceiling_m)]
+    below = torch.from_numpy(film.field.means.numpy().astype(np.float64) @ T[2, :3] + T[2, 3] < ceiling_m)
+    seen_from = None if film.seen_from is None else film.seen_from[below]
+    film = replace(film, field=film.field.part(below), seen_from=seen_from)
+    points = points[:: max(1, len(points) // POINTS)].astype(np.float64)
+    return film, se3.inverse(T) @ _orbit_around(points, film, se3.inverse(T), images)
+
+
+def _orbit_around(points: Matrix, film: Film, T_world_floor: Matrix, images: int) -> Matrix:
+    """Return T_floor_camera [images, 4, 4] of an orbit that shows points [P, 3] in the frame of the floor."""
+    camera = film.camera.resized(WIDTH_PX, max(2, round(film.camera.height * WIDTH_PX / film.camera.width)))
+    small, turn = replace(film, camera=camera), 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    center, (_, ahead, up) = np.median(points, axis=0), np.eye(3)
+    most, best = -1.0, np.empty((0, 4, 4))
+    for elevation_rad in ORBIT_ELEVATIONS_RAD:
+        local = (points - center) @ orbit(center, up, ahead, 1.0, turn, elevation_rad)[:, :3, :3]
+        beside = np.maximum(
+            np.abs(local[..., 0]) * 2.0 * camera.fx / camera.width,
+            np.abs(local[..., 1]) * 2.0 * camera.fy / camera.height,
+        )
+        radius_m = max(float(np.quantile(beside - local[..., 2], ENOUGH)), 0.1)
+        circle = T_world_floor @ orbit(center, up, ahead, radius_m, turn, elevation_rad)
+        covered = np.array([float((small.seen(T).alpha > COVERED_ALPHA).float().mean()) for T in circle])
+        angles_rad, share = swing(covered, images)
+        if share > most:
+            most, best = share, orbit(center, up, ahead, radius_m, angles_rad, elevation_rad)
+    return best
+
+
+def swing(covered: Matrix, images: int) -> tuple[Matrix, float]:
+    """Return the angles [images] of a film, and the mean share of covered pixels [D] over them: a full turn, or to and
+    fro over the directions around the best one that have at least `ENOUGH` of its share."""
+    count, first = len(covered), int(covered.argmax())
+    good, last = covered >= ENOUGH * covered.max(), first
+    while last - first < count - 1 and good[(last + 1) % count]:
+        last += 1
+    while last - first < count - 1 and good[(first - 1) % count]:
+        first -= 1
+    time = 2.0 * np.pi * np.arange(images) / images
+    if last - first < count - 1:
+        time = 2.0 * np.pi / count * ((first + last) / 2.0 + max(last - first, 1) / 2.0 * np.sin(time))
+    return time, float(covered[np.arange(first, last + 1) % count].mean())
 
 
 CODEC, ENDING = "vp09", ".mp4"
