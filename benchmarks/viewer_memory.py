@@ -193,13 +193,13 @@ def watch(growing: Growing, viewer: "ViewerApp", options: Options) -> dict[str, 
     while (now_s := time.monotonic() - begun_s) < 60.0 * options.minutes:
         live(growing())
         if now_s >= SAMPLE_S * (len(samples) + 1):
-            viewer.panel.mode.value, viewer.panel.colouring.value = MODES["splats"], "colour"
+            viewer.panel.mode.value, viewer.panel.colouring.value = MODES["splats"], "their own"
             show(live.snapshot())
             time.sleep(REST_S)
             memory = {"resident_mib": resident_mib(), "in_use_mib": in_use_mib()}
             samples.append({"s": now_s, **memory, "clients": len(viewer.server.get_clients())})
         viewer.panel.mode.value = [*MODES.values()][int(now_s / CHANGE_S) % len(MODES)]
-        viewer.panel.colouring.value = ("colour", "uncertainty")[int(now_s / CHANGE_S / len(MODES)) % 2]
+        viewer.panel.colouring.value = ("their own", "how unsure")[int(now_s / CHANGE_S / len(MODES)) % 2]
         time.sleep(max(0.0, growing.frames / options.frames_per_s - (time.monotonic() - begun_s)))
     return {
         "minutes": options.minutes, "frames": growing.frames, "keyframes": len(growing.slam.keyframe_indices),

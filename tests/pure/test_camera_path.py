@@ -66,7 +66,7 @@ def test_one_pose_or_equal_times_give_a_path_and_no_pose_or_no_image_is_an_error
 @pytest.mark.parametrize("T", [np.eye(4), WORLD])
 def test_an_orbit_is_a_closed_circle_that_looks_down_at_its_centre(T: np.ndarray) -> None:
     up, start, center = T[:3, :3] @ [0, 0, 1.0], T[:3, :3] @ [0.3, 1.0, 0.2], T[:3, :3] @ [1.0, 2.0, 0.5] + T[:3, 3]
-    poses = orbit(center, up, start, 4.0, 8, elevation_rad=np.pi / 6)
+    poses = orbit(center, up, start, 4.0, np.pi / 4 * np.arange(8), elevation_rad=np.pi / 6)
     for pose in poses:
         assert se3.is_rigid(pose, 1e-9)
         x, y, z, _ = np.linalg.inv(pose) @ np.append(center, 1.0)

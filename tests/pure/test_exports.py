@@ -24,7 +24,7 @@ from sigmasplat.plugins.outputs.drawing.view_panels import FOOT, GAP, HEAD, PANE
 from sigmasplat.plugins.outputs.floorplan.picture import export_plan
 from sigmasplat.plugins.outputs.mesh_files import write_mesh
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.plugins.outputs.video import export_video, film_camera, image_count, orbit_view
+from sigmasplat.plugins.outputs.video import Film, export_video, film_camera, image_count, orbit_view, swing
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 
@@ -158,18 +158,56 @@ def test_a_film_of_colour_alone_has_one_panel_and_no_legend(reader: RunReader, t
     assert first.shape == (48, 64, 3) and np.abs(first.astype(int) - 128).max() < 12
 
 
-def test_the_orbit_view_removes_the_ceiling_and_shows_the_whole_room() -> None:
+def test_the_orbit_view_removes_the_ceiling_and_shows_most_of_the_room() -> None:
     high = GaussianField.from_values(torch.tensor([[0.0, 0.0, 2.4]]), torch.tensor([0.1]), torch.ones(1, 3))
     field = splats(WORLD)
     floor_splats = len(field)
     field.append(high.moved(torch.from_numpy(WORLD)))
-    kept, poses = orbit_view(field, PATH, CAMERA, 4, seer(WORLD))
-    assert len(kept) == floor_splats and len(field) == floor_splats + 1, "the map itself is not changed"
-    for T in poses:
-        corners = np.array([[x, y, 0.0, 1.0] for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1])])
-        x, y, z, _ = np.linalg.inv(T) @ WORLD @ corners.T
-        assert (z > 0.5).all() and (T_ROOM @ T)[2, 3] > 2.0
-        assert (np.abs(CAMERA.fx * x / z) < 80).all() and (np.abs(CAMERA.fy * y / z) < 75).all()
+    film, poses = orbit_view(Film(field, CAMERA, seer(WORLD)), PATH, 4)
+    assert len(film.field) == floor_splats and len(field) == floor_splats + 1, "the map itself is not changed"
+    points = field.means[:floor_splats].numpy()
+    inside = [
+        np.mean((np.abs(CAMERA.fx * x / z) < CAMERA.width / 2) & (np.abs(CAMERA.fy * y / z) < CAMERA.height / 2))
+        for x, y, z in (((points - T[:3, 3]) @ T[:3, :3]).T for T in poses)
+    ]
+    assert np.mean(inside) > 0.6 and min((T_ROOM @ T)[2, 3] for T in poses) > 0.5, "above the floor"
+
+
+def test_an_orbit_turns_fully_or_swings_where_the_map_covers_the_image() -> None:
+    full, share = swing(np.full(24, 0.8), 8)
+    np.testing.assert_allclose(full, np.pi / 4 * np.arange(8))
+    assert share == pytest.approx(0.8)
+    covered = np.where(np.isin(np.arange(24), [22, 23, 0, 1, 2]), 0.9, 0.3)
+    covered[12] = 0.85  # well covered too, but not beside the best direction
+    angles, share = swing(covered, 100)
+    assert share == pytest.approx(0.9)
+    away = np.angle(np.exp(1j * angles))
+    assert np.abs(away).max() == pytest.approx(2 * np.pi / 12, rel=0.01) and angles[0] == pytest.approx(angles[50])
+
+
+def test_films_hide_splats_seen_from_behind_and_what_is_not_sure(reader: RunReader, tmp_path: Path) -> None:
+    field = reader.run.read_map()
+    toward = torch.zeros(len(field), 3)
+    toward[::2, 2] = 1.0  # seen from +z only; the directions of the others are not known
+    std = SplatStd(torch.where(torch.arange(len(field)) % 3 > 0, 1e-4, 9.0), torch.ones(len(field)))
+    splats = torch.cat([torch.zeros(len(field), 3), toward], 1)
+    reader.run.write_uncertainty(MapUncertainty(splats, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, std=std))
+    shown: list[int] = []
+
+    def count(field: GaussianField, camera: Camera, T: np.ndarray, reference: object = None) -> object:
+        shown.append(len(field))
+        return seer(WORLD)(field, camera, T)
+
+    far = np.eye(4)
+    far[2, 3] = -100.0
+    sure = int((std.depth_std_m < 1.0).sum())
+    for options, kept in (({}, sure), ({"uncertain": True}, len(field)), ({"std_below_m": 1e-3}, sure)):
+        film = Film.of(reader, CAMERA, count, **options)
+        film.seen(far)
+        assert len(film.field) == kept
+        assert (shown[-1] == kept) == ("uncertain" in options) and shown[-1] > 0.4 * kept
+    with pytest.raises(RunError, match="use a weaker bound"):
+        Film.of(reader, CAMERA, count, std_below_m=1e-9)
 
 
 def test_the_length_and_the_size_of_a_film(reader: RunReader, tmp_path: Path) -> None:

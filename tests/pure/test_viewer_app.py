@@ -7,12 +7,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
-from room_map import room_map
+from room_map import poses, room, room_map
+from sigmasplat.data.field import GaussianField
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
 viser = pytest.importorskip("viser", reason="viser is not installed (pip install 'sigmasplat[viewer]')")
@@ -21,7 +24,7 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 from sigmasplat.plugins.viewer.app import ViewerApp  # noqa: E402
 from sigmasplat.plugins.viewer.layers import MODES, PREDICTED_MODES  # noqa: E402
 from sigmasplat.plugins.viewer.server import HOST, close, open_server  # noqa: E402
-from sigmasplat.plugins.viewer.snapshot import EMPTY_PATH, Piece, Snapshot  # noqa: E402
+from sigmasplat.plugins.viewer.snapshot import EMPTY_PATH, Opening, Piece, Snapshot  # noqa: E402
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView  # noqa: E402
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
@@ -86,11 +89,10 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
     wait_until(lambda: panel.row.max == panel.row.value == FRAMES - 1 and "growing" in panel.facts.content)
     assert not panel.legend.visible, "the splats' own colours need no legend"
 
-    panel.colouring.value = "uncertainty"
+    assert not panel.floating.visible and not panel.floating.value, "a live run stays where it is"
+    panel.colouring.value = "how unsure"
     wait_until(lambda: panel.legend.visible)
-    texts = panel.hidden_text.content
-    panel.hidden.value = 50
-    wait_until(lambda: panel.hidden_text.content != texts)
+    assert not panel.unsure.visible, "submaps have no measured errors"
     offered = [mode for mode in MODES if MODES[mode] in panel.mode.options]
     assert set(MODES) - set(offered) == {*PREDICTED_MODES}, "submaps have no predicted errors"
     assert not panel.keyframes.value, "the viewer opens without frusta"
@@ -110,19 +112,18 @@ def test_a_growing_run_is_shown_and_the_controls_follow(
 def test_predicted_errors_are_offered_for_the_final_map_only(
     app: ViewerApp, client: list[int], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The errors have a legend, and hiding the most uncertain ones hides the splats with the larger error."""
+    """The errors have a legend, and what is uncertain is shown only on request."""
     field, panel = room_map(), app.panel
     half = torch.arange(len(field)) % 2 == 0
     variances = torch.where(half[:, None], torch.tensor([0.01, 1e-4, 1e-4]), torch.tensor([0.01, 0.04, 0.04]))
     std = SplatStd(torch.where(half, 0.01, 0.2), torch.full((len(field),), 0.1))
     known = MapUncertainty(variances, Background((0.5, 0.5, 0.5), 0.1, 1.0), SHIPPED, 4, std)
-    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known)))
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field, uncertainty=known, sure=half)))
     offered = lambda: {MODES[mode] for mode in PREDICTED_MODES} <= {*panel.mode.options}  # noqa: E731
     wait_until(offered)
-    everything = panel.facts.content
-    panel.hidden.value = 60
-    wait_until(lambda: "error of depth above" in panel.hidden_text.content and " m" in panel.hidden_text.content)
-    assert panel.facts.content != everything and f"{int(half.sum()):,} of {len(field):,}" in panel.facts.content
+    wait_until(lambda: f"{int(half.sum()):,} of {len(field):,} splats" in panel.facts.content and panel.unsure.visible)
+    panel.unsure.value = True
+    wait_until(lambda: f"{len(field):,} of {len(field):,} splats" in panel.facts.content)
     for mode in PREDICTED_MODES:
         before = len(client)
         panel.mode.value = MODES[mode]
@@ -131,3 +132,51 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
     app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
     wait_until(lambda: not offered())
     assert panel.mode.value == MODES["splats"] and "viewer:" not in capsys.readouterr().err, "no error while drawing"
+
+
+def turned(client: Any, opening: Opening) -> float:
+    """Return the angle in degrees between a browser's camera and the opening, seen from what it looks at."""
+    at = opening.T_world_camera @ np.array([0.0, 0.0, opening.ahead_m, 1.0])
+    away, start = client.camera.position - at[:3], opening.T_world_camera[:3, 3] - at[:3]
+    return float(np.degrees(np.arccos(np.clip(away @ start / np.linalg.norm(away) / np.linalg.norm(start), -1.0, 1.0))))
+
+
+def test_a_browser_opens_at_the_best_view_and_floats_until_a_person_moves_it(app: ViewerApp, client: list[int]) -> None:
+    opening = Opening(poses()[1], 2.0, 0.8, np.array([0.0, -1.0, 0.0]))
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, room_map()), opening=opening))
+    (page,) = app.server.get_clients().values()
+    wait_until(lambda: bool(np.allclose(page.camera.position, opening.T_world_camera[:3, 3], atol=1e-6)))
+    assert page.camera.fov == pytest.approx(0.8)
+    np.testing.assert_allclose(app.server.initial_camera.position, opening.T_world_camera[:3, 3])
+    wait_until(lambda: turned(page, opening) > 0.3)
+    assert app.panel.floating.value and turned(page, opening) < 2.1
+    before = page.camera.position
+    page.camera.position = before + 0.2
+    wait_until(lambda: not app.panel.floating.value)
+    np.testing.assert_allclose(page.camera.position, before + 0.2)
+
+
+def test_the_ruler_measures_between_two_clicked_points(app: ViewerApp) -> None:
+    frame, T = room().frame(0), poses()[0]
+    rays, depth_m = room().camera.rays(), frame.depth_m
+    points = (rays * depth_m[..., None]).reshape(-1, 3) @ T[:3, :3].T + T[:3, 3]
+    field = GaussianField.from_values(
+        torch.tensor(points, dtype=torch.float32),
+        torch.tensor(depth_m.reshape(-1, 1) / room().camera.fx, dtype=torch.float32).expand(-1, 3).contiguous(),
+        torch.full((len(points), 3), 0.5),
+        opacities=0.99,
+    )
+    app.show(Snapshot("room", EMPTY_PATH, Piece(None, field)))
+    rows = [(20, 10), (60, 80)]
+    app.ruler.start()
+    assert app.panel.length.content == "click the first point"
+    for click, (row, column) in enumerate(rows):
+        direction = T[:3, :3] @ rays[row, column]
+        app.ruler.clicked(SimpleNamespace(ray_origin=tuple(T[:3, 3]), ray_direction=tuple(direction)))
+        assert click or app.panel.length.content == "click the second point"
+    ends = [T[:3, :3] @ (rays[at] * depth_m[at]) for at in rows]
+    length_m = float(app.panel.length.content.split(" m")[0])
+    assert length_m == pytest.approx(np.linalg.norm(ends[1] - ends[0]), rel=0.02)
+    app.ruler.start()
+    app.ruler.clicked(SimpleNamespace(ray_origin=(0.0, 0.0, 0.0), ray_direction=(0.0, 0.0, -1.0)))
+    assert app.panel.length.content == "no surface there: click another point"

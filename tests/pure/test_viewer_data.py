@@ -18,19 +18,18 @@ from sigmasplat.plugins.viewer.layers import (
     browser_camera,
     covariances,
     draw_legend,
-    largest_shown,
     merge_pieces,
     merged_uncertainty,
     palette_range,
     render_layer,
     render_predicted,
     shown,
-    sorted_uncertainties,
     splat_arrays,
     uncertainties,
 )
 from sigmasplat.plugins.viewer.panel import escaped
 from sigmasplat.plugins.viewer.snapshot import CameraPath, Piece, Snapshot, thin, within_budget
+from sigmasplat.plugins.viewer.snapshot_sources import final_piece
 from sigmasplat.render import render
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 from sigmasplat.uncertainty.predictive import predict
@@ -86,46 +85,34 @@ def test_covariances_equal_rotated_squared_scales() -> None:
         np.testing.assert_allclose(covariance, R @ np.diag(scale.astype(float) ** 2) @ R.T, rtol=1e-4, atol=1e-8)
 
 
-def test_the_filter_hides_the_requested_share() -> None:
+def test_the_palette_ends_at_a_high_percentile_of_the_visible_splats() -> None:
     pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
-    ordered = sorted_uncertainties(pieces)
-    assert len(ordered) == 1000 and (np.diff(ordered) >= 0).all()
-    most = largest_shown(ordered, 0.25)
-    kept = [shown(piece, most) for piece in pieces]
-    assert sum(int(k.sum()) for k in kept) == pytest.approx(750, abs=1)
-    hidden = torch.cat([~k for k in kept])
-    σ = torch.cat([p.field.variances.mean(1).sqrt() for p in pieces])
-    assert σ[hidden].min() >= σ[~hidden].max()
-    assert shown(pieces[0], largest_shown(ordered, 0.0)).all()
-    assert (
-        len(sorted_uncertainties(())) == 0
-        and largest_shown(sorted_uncertainties(()), 0.5) == np.inf
-        and palette_range(sorted_uncertainties(())) == (0.0, 1.0)
-    )
+    values = np.concatenate([uncertainties(piece).numpy() for piece in pieces])
+    assert palette_range(pieces) == (0.0, pytest.approx(np.percentile(values, 99)))
+    assert palette_range(()) == (0.0, 1.0)
 
 
 def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     field = field_of(50)
     sigma = uncertainties(Piece(None, field))
-    plain = splat_arrays(Piece(None, field), "colour", (0.0, 1.0), np.inf)
+    plain = splat_arrays(Piece(None, field), None, True)
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), np.inf)
+    tinted = splat_arrays(Piece(None, field), (0.0, 0.3), False)
     np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma.numpy(), 0.0, 0.3, colormap.INFERNO))
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     most, least = int(sigma.numpy().argmax()), int(sigma.numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
-    half = splat_arrays(Piece(None, field), "uncertainty", (0.0, 0.3), float(np.median(sigma.numpy())))
-    assert len(half) == len(half.covariances) == len(half.colors) == 25
+    half = splat_arrays(Piece(None, field, sure=sigma < sigma.median()), (0.0, 0.3), False)
+    assert len(half) == len(half.covariances) == len(half.colors) == int((sigma < sigma.median()).sum())
 
 
 def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
-    pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T))
-    most = largest_shown(sorted_uncertainties(pieces), 0.4)
-    whole = merge_pieces(pieces, most)
-    moved = pieces[1].field.moved(torch.from_numpy(T)).means[shown(pieces[1], most)]
-    torch.testing.assert_close(whole.means[-len(moved) :], moved)
-    assert len(whole) == 30 and len(pieces[0].field) == 30
+    sure = torch.arange(20) % 4 > 0
+    pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T, sure=sure))
+    whole = merge_pieces(pieces, False)
+    torch.testing.assert_close(whole.means[30:], pieces[1].field.moved(torch.from_numpy(T)).means[sure])
+    assert len(whole) == 45 and len(pieces[0].field) == 30 and len(merge_pieces(pieces, True)) == 50
 
 
 def test_merging_pieces_equals_moving_and_appending_fields() -> None:
@@ -133,7 +120,7 @@ def test_merging_pieces_equals_moving_and_appending_fields() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
     second.get_or_create("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
-    found = merge_pieces((Piece(0, first), Piece(1, second, T)), np.inf)
+    found = merge_pieces((Piece(0, first), Piece(1, second, T)), False)
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
@@ -161,8 +148,6 @@ def test_the_path_is_drawn_up_to_a_frame_in_submap_colours_with_lost_frames_in_r
     expected = [lines.LOST_COLOUR if i in (5, 6) else first if i < 10 else second for i in range(13)]
     np.testing.assert_array_equal(drawn.colors[:, 0], expected[:-1])
     np.testing.assert_array_equal(drawn.colors[:, 1], expected[1:])
-    np.testing.assert_array_equal(lines.lost_points(path, 5)[:, 0], [5])
-    assert len(lines.lost_points(path, 29)) == 2 and len(lines.lost_points(path, -1)) == 0
     assert len(lines.path_segments(path_of(0), 0).points) == 0 == len(lines.path_segments(path_of(1), 0).points)
 
 
@@ -171,7 +156,6 @@ def test_frames_that_are_not_connected_to_the_world_are_not_drawn() -> None:
     path = replace(whole, outside=(np.arange(30) >= 12) & (np.arange(30) < 20))
     drawn = lines.path_segments(path, 29)
     np.testing.assert_array_equal(drawn.points[:, 0, 0], [*range(11), *range(20, 29)])
-    np.testing.assert_array_equal(lines.lost_points(path, 29)[:, 0], [5])
     assert lines.keyframes_to_show(path, 29) == (0, 5, 10, 20, 25)
 
 
@@ -236,26 +220,26 @@ def uncertain(count: int, seed: int = 0) -> Piece:
     background = Background((0.2, 0.5, 0.8), 0.1, 1.0)
     std = SplatStd(*torch.rand(2, count, generator=random))
     known = MapUncertainty(0.01 * torch.rand(count, 3, generator=random), background, SHIPPED, 4, std)
-    return Piece(None, field_of(count, seed), uncertainty=known)
+    return final_piece(field_of(count, seed), known, np.eye(4)[None])
 
 
-def test_splats_with_a_large_depth_error_are_hidden() -> None:
+def test_splats_that_are_not_sure_are_hidden_unless_they_are_asked_for() -> None:
     piece = uncertain(200)
-    std_m = piece.uncertainty.std.depth_std_m  # type: ignore[union-attr]
-    limit_m = float(std_m.median())
-    most = limit_m
-    assert torch.equal(shown(piece, most), std_m <= limit_m)
-    drawn = splat_arrays(piece, "colour", (0.0, 1.0), most)
-    np.testing.assert_array_equal(drawn.centers, piece.field.means[std_m <= limit_m].numpy())
-    merged, known = merge_pieces([piece], most), merged_uncertainty([piece], most)
+    sure = piece.sure
+    assert sure is not None and 0 < int(sure.sum()) < 200 and torch.equal(shown(piece, False), sure)
+    drawn = splat_arrays(piece, None, False)
+    np.testing.assert_array_equal(drawn.centers, piece.field.means[sure].numpy())
+    merged, known = merge_pieces([piece], False), merged_uncertainty([piece], False)
     assert known is not None and len(known.splats) == len(merged) == len(drawn)
-    assert merged_uncertainty([piece, piece], most) is None
+    assert len(splat_arrays(piece, None, True)) == 200 and shown(replace(piece, sure=None), False).all()
+    assert merged_uncertainty([piece, piece], False) is None
 
 
 def test_thinned_splats_keep_their_own_errors() -> None:
     piece = uncertain(100)
     few = piece.thinned(30)
     assert few.uncertainty is not None and piece.uncertainty is not None
+    assert few.sure is not None and piece.sure is not None and len(few.sure) == 30
     for mean, row in zip(few.field.means, few.uncertainty.splats, strict=True):
         (same,) = (piece.field.means == mean).all(1).nonzero()[0]
         assert torch.equal(piece.uncertainty.splats[same], row)

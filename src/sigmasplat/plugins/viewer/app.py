@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import viser
 
-from sigmasplat.api import GaussianField, Matrix, SigmaSplatError
+from sigmasplat.api import Matrix, SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
-from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, Floats, LayerImage, Legend
-from sigmasplat.plugins.viewer.motion import CameraSway
-from sigmasplat.plugins.viewer.panel import ControlPanel, ControlState, escaped
+from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, LayerImage, Legend
+from sigmasplat.plugins.viewer.motion import sway
+from sigmasplat.plugins.viewer.panel import ControlPanel, escaped
 from sigmasplat.plugins.viewer.ruler import Ruler, ShownMap
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, go_to_start, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
@@ -47,17 +47,18 @@ class ViewerApp:
         self.ruler = Ruler(server, self._shown_map, self._show_length)
         self.panel = ControlPanel(server, self.changed, self._look_from, self.ruler.start)
         self.scene = ViserScene(server, self._clicked)
-        self.sway = CameraSway(server, lambda: self.panel.floating.value and self.panel.state().layer is None)
         self._snapshot: Snapshot | None = None
         self._drawn: dict[Any, Any] = {}
-        self._unsure: tuple[list[GaussianField], Floats] = [], layers.sorted_uncertainties(())
         self._merged: tuple[Any, Any] = (None, None)
         self._wake, self._stop = threading.Event(), threading.Event()
         self._sharp, self._can_sharpen = False, False
+        self._threads: list[threading.Thread] = []
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(lambda client: self._drawn.pop(("layer", client.client_id), None))
-        self._thread = threading.Thread(target=self._work, name="viewer", daemon=True)
-        self._thread.start()
+        floating = lambda: bool(self.panel.floating.value) and self.panel.layer is None  # noqa: E731
+        for work in (self._work, lambda: sway(server, floating, self._stop_floating, self._stop)):
+            self._threads.append(threading.Thread(target=work, name="viewer", daemon=True))
+            self._threads[-1].start()
 
     def show(self, snapshot: Snapshot) -> None:
         """Show a snapshot from now on; returns immediately."""
@@ -71,10 +72,10 @@ class ViewerApp:
 
     def stop(self) -> None:
         """End the threads; the server keeps running."""
-        self.sway.stop()
         self._stop.set()
         self._wake.set()
-        self._thread.join()
+        for thread in self._threads:
+            thread.join()
 
     def _work(self) -> None:
         trimmed: Snapshot | None = None
@@ -96,26 +97,22 @@ class ViewerApp:
                 self._stop.wait(LIVE_REST_S if snapshot.live else REST_S)
 
     def _draw(self, snapshot: Snapshot) -> None:
-        path = snapshot.path
-        self.panel.adapt(len(path), snapshot.live, snapshot.true_positions is not None)
-        controls = self.panel.state()
-        pieces = snapshot.visible_pieces(controls.row)
+        panel = self.panel
+        panel.adapt(len(snapshot.path), snapshot.live, snapshot.true_positions is not None)
+        pieces = snapshot.visible_pieces(panel.row.value)
         known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged_uncertainty`
         unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
-        self.panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
-        controls = self.panel.state()
-        span = layers.palette_range(self._uncertainties_of(pieces))
+        panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
+        span = layers.palette_range(pieces) if panel.colouring.value == "how unsure" else None
         with self.server.atomic():
-            self._draw_path(snapshot, controls)
-            self._draw_splats(pieces, controls, span)
-        self._draw_keyframes(snapshot, controls)
-        self._show_texts(snapshot, controls, pieces)
-        self._follow(snapshot, controls)
-        legend = None
-        if controls.mode == "splats" and controls.colouring == "how unsure":
-            legend = Legend(INFERNO, *span, unit)
+            self._draw_path(snapshot)
+            self._draw_splats(pieces, span)
+        self._draw_keyframes(snapshot)
+        self._show_texts(snapshot, pieces)
+        self._follow(snapshot)
+        legend = None if span is None or panel.layer else Legend(INFERNO, *span, unit)
         for client in self.server.get_clients().values():
-            legend = self._draw_layer(client, snapshot, controls, pieces) or legend
+            legend = self._draw_layer(client, snapshot, pieces) or legend
         if self._is_new("legend", legend and legend[1:]):
             self.panel.show_legend(None if legend is None else layers.draw_legend(legend))
 
@@ -127,13 +124,6 @@ class ViewerApp:
         self._drawn[what] = state
         return True
 
-    def _uncertainties_of(self, pieces: tuple[Piece, ...]) -> Floats:
-        """Return the uncertainties of the splats in ascending order."""
-        fields = [piece.field for piece in pieces]
-        if self._unsure[0] != fields:
-            self._unsure = fields, layers.sorted_uncertainties(pieces)
-        return self._unsure[1]
-
     def _open(self, snapshot: Snapshot, first: bool) -> None:
         """Choose the view of browsers that are opened from now on: the best one, or behind the newest camera."""
         inside = snapshot.path.T_world_camera[snapshot.path.inside]
@@ -144,58 +134,54 @@ class ViewerApp:
         for client in self.server.get_clients().values() if first else ():
             go_to_start(client, self.server.initial_camera)
 
-    def _draw_path(self, snapshot: Snapshot, controls: ControlState) -> None:
-        path, row = snapshot.path, controls.row
-        if self._is_new("path", (path, row, controls.path)):
-            self.scene.show_lines("path", lines.path_segments(path, row) if controls.path else None)
-            self.scene.show_lost(lines.lost_points(path, row if controls.path else -1))
+    def _draw_path(self, snapshot: Snapshot) -> None:
+        path, row, shown = snapshot.path, self.panel.row.value, self.panel.path.value
+        if self._is_new("path", (path, row, shown)):
+            self.scene.show_lines("path", lines.path_segments(path, row) if shown else None)
             at = min(row, len(path) - 1)
             current = path.T_world_camera[at] if len(path) and path.inside[at] else None
-            self.scene.show_current_camera(snapshot.camera, current, bool(len(path) and path.lost[at]))
-        truth = snapshot.true_positions
-        if self._is_new("true path", truth is not None and (snapshot, controls.true_path)):
-            shown = truth if controls.true_path else None
-            self.scene.show_lines("truth", None if shown is None else lines.truth_segments(shown))
+            self.scene.show_current_camera(snapshot.camera, current)
+        truth = snapshot.true_positions if self.panel.true_path.value else None
+        if self._is_new("true path", truth is not None and snapshot):
+            self.scene.show_lines("truth", None if truth is None else lines.truth_segments(truth))
 
-    def _draw_splats(self, pieces: tuple[Piece, ...], controls: ControlState, span: tuple[float, float]) -> None:
-        if controls.mode != "splats":
+    def _draw_splats(self, pieces: tuple[Piece, ...], span: tuple[float, float] | None) -> None:
+        if self.panel.layer is not None:
             pieces = ()
-        ends = None if controls.colouring == "their own" else span  # own colours do not depend on the range
-        state = ([(p.name, p.field) for p in pieces], controls.colouring, ends, controls.unsure)
+        state = ([(p.name, p.field) for p in pieces], span, unsure := self.panel.unsure.value)
         if self._is_new("splats", state):
             sent = within_budget(pieces, BUDGET)  # a large final map is rendered completely, but sent thinned
-            how = controls.colouring, span, controls.unsure
-            self.scene.show_splats({p.name: (layers.splat_arrays(p, *how), p.T_world_piece) for p in sent})
+            self.scene.show_splats({p.name: (layers.splat_arrays(p, span, unsure), p.T_world_piece) for p in sent})
         else:
             self.scene.place_splats({piece.name: piece.T_world_piece for piece in pieces})
 
-    def _draw_keyframes(self, snapshot: Snapshot, controls: ControlState) -> None:
-        path = snapshot.path
-        if self._is_new("keyframes", (path, controls.row, controls.keyframes)):
-            rows = lines.keyframes_to_show(path, controls.row) if controls.keyframes else ()
+    def _draw_keyframes(self, snapshot: Snapshot) -> None:
+        path, row, shown = snapshot.path, self.panel.row.value, self.panel.keyframes.value
+        if self._is_new("keyframes", (path, row, shown)):
+            rows = lines.keyframes_to_show(path, row) if shown else ()
             self.scene.show_keyframes(snapshot.camera, {row: path.T_world_camera[row] for row in rows})
 
     def _draw_layer(
-        self, client: viser.ClientHandle, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...]
+        self, client: viser.ClientHandle, snapshot: Snapshot, pieces: tuple[Piece, ...]
     ) -> Legend | None:  # fmt: skip
         """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
-        key, c = ("layer", client.client_id), client.camera
-        if controls.layer is None:
+        key, c, layer = ("layer", client.client_id), client.camera, self.panel.layer
+        if layer is None:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, (field, known, options, backend) = camera_pose(c), self._merge(snapshot, pieces, controls.unsure)
-        state = (controls.layer, pose.tobytes(), c.fov, c.aspect, field)
+        pose, (field, known, options, backend) = camera_pose(c), self._merge(snapshot, pieces)
+        state = (layer, pose.tobytes(), c.fov, c.aspect, field)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
             camera = layers.browser_camera(c.fov, c.aspect, rows)
             made: LayerImage
-            if controls.layer in PREDICTED_MODES and known is not None:
-                made = layers.render_predicted(field, known, camera, pose, controls.layer, options, backend)
+            if layer in PREDICTED_MODES and known is not None:
+                made = layers.render_predicted(field, known, camera, pose, layer, options, backend)
             else:
-                made = layers.render_layer(field, camera, pose, controls.layer, options, backend)
+                made = layers.render_layer(field, camera, pose, layer, options, backend)
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
@@ -204,9 +190,9 @@ class ViewerApp:
         legend: Legend | None = drawn[1]
         return legend
 
-    def _merge(self, snapshot: Snapshot, pieces: tuple[Piece, ...], unsure: bool) -> ShownMap:
+    def _merge(self, snapshot: Snapshot, pieces: tuple[Piece, ...]) -> ShownMap:
         """Return the shown splats as one field, the same object until they change."""
-        splats = ([(p.field, p.T_world_piece.tobytes()) for p in pieces], unsure)
+        splats = ([(p.field, p.T_world_piece.tobytes()) for p in pieces], unsure := self.panel.unsure.value)
         if self._merged[0] != splats:
             merged = layers.merge_pieces(pieces, unsure), layers.merged_uncertainty(pieces, unsure)
             self._merged = splats, ShownMap(*merged, snapshot.options, snapshot.backend)
@@ -214,10 +200,8 @@ class ViewerApp:
         return shown
 
     def _shown_map(self) -> ShownMap | None:
-        snapshot, controls = self._snapshot, self.panel.state()
-        if snapshot is None:
-            return None
-        return self._merge(snapshot, snapshot.visible_pieces(controls.row), controls.unsure)
+        snapshot = self._snapshot
+        return None if snapshot is None else self._merge(snapshot, snapshot.visible_pieces(self.panel.row.value))
 
     def _show_length(self, points: list[Matrix], text: str) -> None:
         """Draw the ruler between the points that were clicked so far, none to two."""
@@ -226,10 +210,10 @@ class ViewerApp:
         self.scene.show_label(text if len(points) > 1 else "first point", np.mean(points, axis=0) if points else None)
         self.panel.length.content = text
 
-    def _show_texts(self, snapshot: Snapshot, controls: ControlState, pieces: tuple[Piece, ...]) -> None:
+    def _show_texts(self, snapshot: Snapshot, pieces: tuple[Piece, ...]) -> None:
         path = snapshot.path
         splats = sum(len(p.field) for p in pieces)
-        kept = sum(int(layers.shown(p, controls.unsure).sum()) for p in pieces)
+        kept = sum(int(layers.shown(p, self.panel.unsure.value).sum()) for p in pieces)
         submaps = int(path.submaps[-1]) + 1 if len(path) else 0
         outside = int((~path.inside & ~path.lost).sum())
         apart = f", {outside} apart (not shown)" if outside else ""
@@ -239,26 +223,23 @@ class ViewerApp:
             f"{int(path.lost.sum())} lost{apart}, {submaps} submap{'s' * (submaps != 1)}  \n"
             f"{kept:,} of {splats:,} splats shown"
         )
-        self.panel.facts.content, self.panel.frame.content = facts, _frame_text(snapshot, controls.row)
+        self.panel.facts.content, self.panel.frame.content = facts, _frame_text(snapshot, self.panel.row.value)
 
-    def _follow(self, snapshot: Snapshot, controls: ControlState) -> None:
+    def _follow(self, snapshot: Snapshot) -> None:
         path = snapshot.path
-        if controls.follow and snapshot.live and len(path) and self._is_new("followed", path):
+        if self.panel.follow.value and snapshot.live and len(path) and self._is_new("followed", path):
             for client in self.server.get_clients().values():
                 with client.atomic():
                     move_camera(client.camera, path.T_world_camera[-1], BACK_M, UP_M)
 
     def _welcome(self, client: viser.ClientHandle) -> None:
-        client.camera.on_update(lambda _: self._moved(client))
+        client.camera.on_update(lambda _: self.changed() if self.panel.layer else None)  # the browser draws the rest
         if self._snapshot is not None:
             go_to_start(client, self.server.initial_camera)
         self.changed()
 
-    def _moved(self, client: viser.ClientHandle) -> None:
-        if self.panel.floating.value and self.sway.moved_by_person(client):
-            self.panel.floating.value = False
-        if self.panel.state().layer is not None:  # the browser draws the rest
-            self.changed()
+    def _stop_floating(self) -> None:
+        self.panel.floating.value = False
 
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot
@@ -276,7 +257,7 @@ class ViewerApp:
     def _look_from(self, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot
         if snapshot is not None and len(snapshot.path):
-            self._go(client, snapshot, min(self.panel.state().row, len(snapshot.path) - 1))
+            self._go(client, snapshot, min(self.panel.row.value, len(snapshot.path) - 1))
 
     def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
         """Move a browser's camera to the pose of a frame."""

@@ -59,25 +59,18 @@ def shown(piece: Piece, unsure: bool) -> Tensor:
     return torch.ones(len(piece.field), dtype=torch.bool) if unsure or piece.sure is None else piece.sure
 
 
-def sorted_uncertainties(pieces: Sequence[Piece]) -> Floats:
-    """Return the uncertainties of all visible splats in ascending order; of all splats if none is visible."""
-    known = [(uncertainties(piece), piece.field.opacities >= MIN_VISIBLE_OPACITY) for piece in pieces]
-    found = [values[shown].numpy() for values, shown in known]
-    if not sum(map(len, found)):
-        found = [values.numpy() for values, _ in known]
-    return np.sort(np.concatenate([np.empty(0, np.float32), *found]))
+def palette_range(pieces: Sequence[Piece]) -> tuple[float, float]:
+    """Return the range of uncertainties that the palette covers: from 0 to a high percentile of the visible splats."""
+    values = np.concatenate([np.empty(0, np.float32), *(uncertainties(piece).numpy() for piece in pieces)])
+    visible = np.concatenate([np.empty(0, bool), *(p.field.opacities.numpy() >= MIN_VISIBLE_OPACITY for p in pieces)])
+    return 0.0, colormap.value_range(values, visible)[1]
 
 
-def palette_range(ordered: Floats) -> tuple[float, float]:
-    """Return the range of values that the palette covers: from 0 to a high percentile."""
-    return 0.0, colormap.value_range(ordered, np.ones(len(ordered), bool))[1]
-
-
-def splat_arrays(piece: Piece, colouring: Colouring, span: tuple[float, float], unsure: bool) -> SplatArrays:
-    """Return the shown splats in their own colours, or coloured by uncertainty over the range `span`."""
+def splat_arrays(piece: Piece, span: tuple[float, float] | None, unsure: bool) -> SplatArrays:
+    """Return the shown splats coloured by uncertainty over the range `span`, or in their own colours if None."""
     mask = shown(piece, unsure)
     chosen = field_without_moments(piece.field.params[mask], {})
-    if colouring == "how unsure":
+    if span is not None:
         colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))

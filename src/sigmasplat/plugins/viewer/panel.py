@@ -1,7 +1,6 @@
 """Lay out the controls beside the scene and read their state."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -9,25 +8,6 @@ import viser
 
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
 from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, MODES, PREDICTED_MODES, Colouring
-
-
-@dataclass(frozen=True)
-class ControlState:
-    """The values of the controls at one time."""
-
-    mode: str
-    colouring: Colouring
-    unsure: bool
-    row: int
-    path: bool
-    keyframes: bool
-    true_path: bool
-    follow: bool
-
-    @property
-    def layer(self) -> str | None:
-        """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
-        return None if self.mode == "splats" else self.mode
 
 
 class ControlPanel:
@@ -84,18 +64,11 @@ class ControlPanel:
             )
             self.true_path = gui.add_checkbox("its true path", True, visible=False, hint="blue: measured by others")
 
-    def state(self) -> ControlState:
-        """Return the current values of the controls."""
-        return ControlState(
-            next(mode for mode, label in MODES.items() if label == self.mode.value),
-            self.colouring.value,
-            self.unsure.value,
-            int(self.row.value),
-            self.path.value,
-            self.keyframes.value,
-            self.true_path.value,
-            self.follow.value,
-        )
+    @property
+    def layer(self) -> str | None:
+        """Return the layer that SigmaSplat renders, or None if the browser draws the scene."""
+        mode = next(mode for mode, label in MODES.items() if label == self.mode.value)
+        return None if mode == "splats" else mode
 
     def adapt(self, frames: int, live: bool, truth_known: bool) -> None:
         """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""

@@ -27,17 +27,16 @@ class ShownMap(NamedTuple):
 def point_on_ray(shown: ShownMap, origin: Matrix, direction: Matrix) -> tuple[Matrix, float] | None:
     """Return where a ray [3], [3] meets the surface, D/A in m of the rendered depth where A > ½, and one standard
     deviation (m, nan if not measured) of that depth; None where the map has no surface."""
-    forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    T_camera_world = se3.inverse(look_along(np.asarray(origin, np.float64), forward, np.roll(forward, 1) * [1, 1, -1]))
-    field, known, options, backend = shown
-    middle = PICKED.height // 2, PICKED.width // 2
+    forward = direction / np.linalg.norm(direction)
+    T_camera_world = se3.inverse(look_along(origin, forward, np.eye(3)[np.abs(forward).argmin()]))
+    middle, std_m = (PICKED.height // 2, PICKED.width // 2), float("nan")
     with torch.inference_mode():
-        seen = render(field, PICKED, T_camera_world, None, options, backend)
+        seen = render(shown.field, PICKED, T_camera_world, None, shown.options, shown.backend)
         if (alpha := float(seen.alpha[middle])) <= COVERED_ALPHA:
             return None
-        std_m = float("nan")
-        if known is not None:
-            std_m = float(predict(field, known, PICKED, T_camera_world, options, backend).depth_std_m[middle])
+        if shown.known is not None:
+            found = predict(shown.field, shown.known, PICKED, T_camera_world, shown.options, shown.backend)
+            std_m = float(found.depth_std_m[middle])
     return origin + forward * (float(seen.depth[middle]) / alpha), std_m
 
 
@@ -54,23 +53,18 @@ class Ruler:
         """Remove the last distance and wait for two clicks."""
         self._ends = []
         self.show([], "click the first point")
-        self.server.scene.remove_click_callback(self._clicked)
-        self.server.scene.on_click()(self._clicked)
+        self.server.scene.remove_click_callback(self.clicked)
+        self.server.scene.on_click()(self.clicked)
 
-    def _clicked(self, event: viser.SceneClickEvent) -> None:
+    def clicked(self, event: viser.SceneClickEvent) -> None:
+        """Add the clicked point. ± is one standard deviation at most: as if both errors lay along the distance."""
         shown = self.shown()
         found = shown and point_on_ray(shown, np.array(event.ray_origin), np.array(event.ray_direction))
-        if found is not None:
-            self._ends.append(found)
+        self._ends += [found] if found else []
         points, text = [point for point, _ in self._ends], "click the second point"
         if len(points) == 2:
-            self.server.scene.remove_click_callback(self._clicked)
-            text = length_text(*self._ends)
+            self.server.scene.remove_click_callback(self.clicked)
+            std_m = float(np.hypot(self._ends[0][1], self._ends[1][1]))
+            text = f"{np.linalg.norm(points[1] - points[0]):.3f} m"
+            text += "" if np.isnan(std_m) else f" ± {100.0 * std_m:.1f} cm"
         self.show(points, text if found else "no surface there: click another point")
-
-
-def length_text(first: tuple[Matrix, float], second: tuple[Matrix, float]) -> str:
-    """Return the distance between two points, ± one standard deviation at most: as if both errors lay along it."""
-    text = f"{np.linalg.norm(second[0] - first[0]):.3f} m"
-    std_m = float(np.hypot(first[1], second[1]))
-    return text if np.isnan(std_m) else f"{text} ± {100.0 * std_m:.1f} cm"

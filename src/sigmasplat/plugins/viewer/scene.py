@@ -9,10 +9,10 @@ import viser
 
 from sigmasplat.api import Camera, Matrix, se3
 from sigmasplat.plugins.viewer.layers import SplatArrays
-from sigmasplat.plugins.viewer.snapshot import LOST_COLOUR, Bytes, Floats, Opening, Segments
+from sigmasplat.plugins.viewer.snapshot import Bytes, Opening, Segments
 
 FRUSTUM_M = 0.08
-LINE_PX, FRUSTUM_PX, DOT_M = {"path": 4.0, "truth": 2.0, "ruler": 3.0}, 1.0, 0.03
+LINE_PX, FRUSTUM_PX = {"path": 4.0, "truth": 2.0, "ruler": 3.0}, 1.0
 KEYFRAME_COLOUR, CURRENT_COLOUR = (112, 120, 130), (255, 210, 60)
 AHEAD_M = 1.0
 """Distance in front of a moved camera of the point that the mouse rotates it about."""
@@ -76,26 +76,14 @@ class ViserScene:
         self.server.initial_camera.fov = opening.fov
         move_camera(self.server.initial_camera, opening.T_world_camera, ahead_m=opening.ahead_m)
 
-    def show_lost(self, points: Floats) -> None:
-        """Mark the positions [L, 3] of lost frames."""
-        if not len(points):
-            self._drop("lost")
-            return
-        self._marks["lost"] = self.server.scene.add_point_cloud(
-            "/lost", points, LOST_COLOUR, point_size=DOT_M, point_shape="circle"
-        )
-
-    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None, lost: bool = False) -> None:
-        """Show the camera of the frame selected on the timeline; a lost one has another colour."""
-        shown, hidden = ("lost camera", "current") if lost else ("current", "lost camera")
-        self._drop(hidden)
+    def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None) -> None:
+        """Show the camera of the frame selected on the timeline, or remove it if None."""
         if T_world_camera is None:
-            self._drop(shown)
+            self._drop("current")
             return
-        if shown not in self._marks:
-            colour = LOST_COLOUR if lost else CURRENT_COLOUR
-            self._marks[shown] = self._frustum(f"/{shown.replace(' ', '-')}", camera, 1.5 * FRUSTUM_M, colour)
-        _place(self._marks[shown], T_world_camera)
+        if "current" not in self._marks:
+            self._marks["current"] = self._frustum("/current", camera, 1.5 * FRUSTUM_M, CURRENT_COLOUR)
+        _place(self._marks["current"], T_world_camera)
 
     def show_keyframes(self, camera: Camera, T_world_camera: Mapping[int, Matrix]) -> None:
         """Show exactly the frusta of these keyframes, by row."""

@@ -205,12 +205,6 @@ def truth_segments(positions: Matrix, most: int = MAX_SEGMENTS) -> Segments:
     return _segments(positions[rows], np.tile(np.array(TRUTH_COLOUR, np.uint8), (len(rows), 1)))
 
 
-def lost_points(path: CameraPath, row: int, most: int = MAX_SEGMENTS) -> Floats:
-    """Return the estimated positions [L, 3] m of the lost frames up to `row`, at most `most`."""
-    rows = np.flatnonzero((path.lost & path.inside)[: row + 1])
-    return np.asarray(path.T_world_camera[rows[evenly_spaced(len(rows), most)], :3, 3], np.float32)
-
-
 def keyframes_to_show(path: CameraPath, row: int, most: int = MAX_KEYFRAMES) -> tuple[int, ...]:
     """Return the rows of at most `most` keyframes up to frame `row`: every 2ᵏ-th one and the last.
 
