@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def view(run: options.RunPath, host: options.Host = HOST, port: options.Port = PORT) -> int:
-    """Show a run in the browser: map, path, uncertainty.
+    """Show a run in the browser: map, path, uncertainty, distances. It opens at the view that shows most.
 
     example: sigmasplat view runs/kitchen-sigma
     """

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -26,7 +26,6 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
 from sigmasplat.plugins.viewer.snapshot import Piece, field_without_moments
 
-Colouring = Literal["their own", "how unsure"]
 Floats = NDArray[np.float32]
 
 

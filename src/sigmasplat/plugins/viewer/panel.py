@@ -1,13 +1,13 @@
 """Lay out the controls beside the scene and read their state."""
 
 from collections.abc import Callable
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import viser
 
 from sigmasplat.plugins.outputs.drawing.colormap import NO_READING, Rgb
-from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, MODES, PREDICTED_MODES, Colouring
+from sigmasplat.plugins.viewer.layers import LEGEND_SIZE, MODES, PREDICTED_MODES
 
 
 class ControlPanel:
@@ -36,7 +36,7 @@ class ControlPanel:
         with gui.add_folder("Scene"):  # Any: mypy takes `value` for read-only
             self.mode: Any = gui.add_dropdown("show", _mode_options(predicted=False))
             self.colouring: Any = gui.add_dropdown(
-                "colours", get_args(Colouring), hint="dark = the run is sure of this part, bright = unsure"
+                "colours", ("their own", "how unsure"), hint="dark = the run is sure of this part, bright = unsure"
             )
             self.legend = gui.add_image(np.zeros((*LEGEND_SIZE[::-1], 3), np.uint8), visible=False, format="png")
             self.unsure: Any = gui.add_checkbox(

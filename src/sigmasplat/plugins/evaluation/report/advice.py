@@ -19,7 +19,7 @@ def next_commands(run: str) -> list[Advice]:
     """Return what can be done with any map."""
     path, name = shlex.quote(run), shlex.quote(PurePath(run).name)
     return [
-        ("View the map in 3D, and hide uncertain splats:", f"sigmasplat view {path}"),
+        ("View the map in 3D, and measure distances:", f"sigmasplat view {path}"),
         ("Write the map for other viewers:", f"sigmasplat export {path} --out {name}.spz"),
         ("Write a mesh for other programs:", f"sigmasplat mesh {path} --out {name}.glb"),
     ]
