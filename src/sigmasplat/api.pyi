@@ -97,6 +97,7 @@ from sigmasplat.final.fusion import (
     count_keyframes as count_keyframes,
     fuse as fuse,
     surface_views as surface_views,
+    voxel_edge as voxel_edge,
 )
 from sigmasplat.fit.adam import BETA1 as BETA1, BETA2 as BETA2, EPSILON as EPSILON, Rates as Rates
 from sigmasplat.fit.backends import TORCH as TORCH, fits_of as fits_of

@@ -58,7 +58,7 @@ UpEdge = Annotated[
 ]  # fmt: skip
 VoxelM = Annotated[float | None, Range(0, open_below=True), arg(
     "M", "edge of a voxel in metres; the truncation distance is 4 voxels",
-    "(default: 0.01, times the scale of the scene)",
+    "(default: a pixel at the median depth, at most 0.01, times the scale of the scene)",
 )]  # fmt: skip
 WithMesh = Annotated[bool, flag("also write mesh.ply, and score it if the true surface is known", name="mesh")]
 InRun = Annotated[Path, arg("RUN", "folder of a finished run, in whose map to search", name="in")]

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sigmasplat.config import Config
+from sigmasplat.config.input import SENSORS, sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
+from sigmasplat.data.images import distance_std
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.data.submap import Picture, SubmapStore
 from sigmasplat.final.tsdf import Tsdf, extract_surface
@@ -25,6 +27,9 @@ from sigmasplat.types import Matrix, Progress, no_progress
 VOXEL_M = 0.01
 TRUNCATION_VOXELS = 4
 """VarSplat §7: 1 cm, truncated at 4 cm."""
+MOST_BLOCKS, PIXEL_STEP, COARSE = 1 << 16, 4, 4
+"""Largest number of blocks: 0.8 GB, and four times as much with the surface. They are counted in every fourth row and
+column, for voxels four times as large, within 5 %."""
 LEAST_ALPHA = 0.9
 """A pixel counts if its alpha reaches this value; its depth is then Σwz / Σw."""
 STEP_SHARE, AGREE_SHARE, RENDER_WEIGHT = 0.05, 0.05, np.float32(1.0)
@@ -41,24 +46,25 @@ Renderer = Callable[[GaussianField, Camera, Matrix], Render]
 @dataclass(frozen=True, eq=False)
 class FusionView:
     """A view to render and fuse: a field, a camera, and its pose in the field's frame and in the world; picture: the
-    recorded images of the view, if they are fused too."""
+    recorded images of the view, if they are fused too, and their exposure [3, 2] (`data.camera`; None: the map's)."""
 
     field: GaussianField
     camera: Camera
     T_camera_field: Matrix
     T_world_camera: Matrix
     picture: Picture | None = None
+    exposure: Matrix | None = None
 
 
 def surface_views(
     read_field: Callable[[], GaussianField], store: SubmapStore, anchors: Sequence[Matrix], config: Config,
-    outside: Collection[int] = (), T_world_keyframe: Matrix | None = None,
+    outside: Collection[int] = (), T_world_keyframe: Matrix | None = None, exposures: Matrix | None = None,
 ) -> Iterator[FusionView]:  # fmt: skip
     """Yield the views of a finished run's surface at its keyframes, as `surface.depth` says.
 
     read_field: returns the final map in the world, called if it is fused; anchors: T_world_submap of each submap;
     outside: the submaps that are not connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses
-    of all keyframes of all submaps, if the final map has moved them.
+    of all keyframes of all submaps, if the final map has moved them; exposures [F, 3, 2]: those of all frames, if known.
     """
     if config.surface.depth == "map":
         yield from fusion_views(store, anchors, outside)
@@ -71,7 +77,9 @@ def surface_views(
             poses = T_world_keyframe[first : first + len(poses)]
         first += len(poses)
         for k, T in enumerate(poses) if index not in outside else ():
-            yield FusionView(field, submap.camera, se3.inverse(T), T, store.picture(index, k))
+            frame = submap.frames[k]  # below 0: of an earlier session
+            exposure = None if exposures is None or frame < 0 else exposures[frame]
+            yield FusionView(field, submap.camera, se3.inverse(T), T, store.picture(index, k), exposure)
 
 
 def fusion_views(store: SubmapStore, anchors: Sequence[Matrix], outside: Collection[int] = ()) -> Iterator[FusionView]:
@@ -95,6 +103,33 @@ def _inside(store: SubmapStore, outside: Collection[int]) -> list[int]:
     return [index for index in range(len(store)) if index not in outside]
 
 
+def voxel_edge(views: Iterable[FusionView], config: Config) -> float:
+    """Return the edge of a voxel for a surface of these views, m.
+
+    It is 1 cm, times the scale of the scene (VarSplat §7). With readings it is less where they show more: the width of a
+    working pixel at their median depth. It is not below half the standard deviation of a reading there, so that the
+    truncation of 4 voxels contains most readings of one surface. It is more in a scene that would need more than
+    `MOST_BLOCKS`. An unknown sensor is taken for one of structured light.
+    """
+    seen, step = list[tuple[Floats, Floats, Matrix]](), slice(None, None, PIXEL_STEP)
+    focal_px = 1.0
+    for at in views:
+        depth_m = np.empty((0, 0), np.float32) if at.picture is None else at.picture.depth_m[step, step]
+        if depth_m.any():
+            rays, focal_px = at.camera.rays()[step, step][depth_m > 0], at.camera.fx
+            seen.append((rays, depth_m[depth_m > 0], at.T_world_camera))
+    voxel_m = VOXEL_M * config.render.scene_scale
+    if not seen:
+        return voxel_m
+    median_m = float(np.median(np.concatenate([depth_m for _, depth_m, _ in seen])))
+    std_m = distance_std(np.full(1, median_m, np.float32), sensor_model(config.input.sensor) or SENSORS["kinect-v1"])
+    voxel_m = min(voxel_m, max(median_m / focal_px, float(std_m[0]) / 2))
+    coarse = Tsdf(COARSE * voxel_m, TRUNCATION_VOXELS * COARSE * voxel_m)
+    for rays, depth_m, T_world_camera in seen:
+        coarse.allocate(rays, depth_m, T_world_camera)
+    return voxel_m * max(1.0, COARSE * float(np.sqrt(len(coarse) / MOST_BLOCKS)))
+
+
 def fuse(
     views: Iterable[FusionView], total: int, config: Config, *, voxel_m: float | None = None,
     renderer: Renderer | None = None, progress: Progress = no_progress,
@@ -102,8 +137,8 @@ def fuse(
     """Fuse depth and colour, rendered at `total` views, into a mesh in the world.
 
     A view with a picture is fused with its readings (`with_readings`). Depth outside the range of the input settings is
-    ignored. Calls `progress(views done, total)`. voxel_m None: 1 cm, times the scale of the scene. Raises ConfigError
-    unless it is above 0.
+    ignored. Calls `progress(views done, total)`. voxel_m None: 1 cm, times the scale of the scene (`voxel_edge`: by the
+    readings). Raises ConfigError unless it is above 0.
     """
     voxel_m = VOXEL_M * config.render.scene_scale if voxel_m is None else voxel_m
     volume = Tsdf(voxel_m, TRUNCATION_VOXELS * voxel_m)
@@ -114,7 +149,8 @@ def fuse(
         depth_m, color = surface_of(seen, config)
         weight = None
         if at.picture is not None:
-            depth_m, color, weight = with_readings(depth_m, color, at.picture)
+            picture = at.picture if at.exposure is None else at.picture.without_exposure(at.exposure)
+            depth_m, color, weight = with_readings(depth_m, color, picture)
         volume.integrate(depth_m, color, at.camera, at.T_world_camera, weight)
         progress(done, total)
     mesh = extract_surface(volume)

@@ -95,7 +95,7 @@ class Tsdf:
         All blocks in view are updated, so that observed free space removes surfaces that only other images saw.
         """
         image = _Image.of(depth_m, color, camera, weight)
-        self._allocate(image, T_world_camera)
+        self.allocate(image.rays, image.depth_m, T_world_camera)
         numbers, corners = self._in_view(image, T_world_camera)
         steps = _projected(LOCAL * self.voxel_m, camera, se3.inverse(T_world_camera)[:3, :3])
         for page in np.unique(numbers // BLOCKS_PER_PAGE):
@@ -104,11 +104,14 @@ class Tsdf:
                 a, b, z = (corners[k, at, None] + steps[k] for k in range(3))
                 self._update(self._pages[page], numbers[at] % BLOCKS_PER_PAGE, image, a, b, z)
 
-    def _allocate(self, image: "_Image", T_world_camera: Matrix) -> None:
-        """Allocate the blocks near the surface: within the truncation along z, or one voxel in any direction."""
+    def allocate(self, rays: Floats, depth_m: Floats, T_world_camera: Matrix) -> None:
+        """Allocate the blocks near a surface: within the truncation along z, or one voxel in any direction.
+
+        rays [P, 3]: those of pixels in the camera's frame, z = 1; depth_m [P]: their depth, above 0.
+        """
         R, t = T_world_camera[:3, :3].astype(np.float32), T_world_camera[:3, 3].astype(np.float32)
-        rays = image.rays @ R.T
-        surface = rays * image.depth_m[:, None] + t
+        rays = rays @ R.T
+        surface = rays * depth_m[:, None] + t
         shifted = [surface + rays * np.float32(share * self.truncation_m) for share in (-1.0, -0.5, 0.5, 1.0)]
         shifted += [surface + ((2 * corner - 1) * self.voxel_m).astype(np.float32) for corner in CORNERS]
         per_metre = np.float32(1.0 / (BLOCK * self.voxel_m))

@@ -32,6 +32,7 @@ from sigmasplat.api import (
     no_progress,
     se3,
     surface_views,
+    voxel_edge,
 )
 from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
@@ -84,9 +85,13 @@ class FusionInput:
                 "run it again"
             )
         outside = self.run.read_frames().submaps_outside() if self.run.component_numbers() else frozenset[int]()
-        moved = tensors.get("T_world_keyframe")
-        T_world_keyframe = None if moved is None else np.asarray(moved, np.float64)
-        views = surface_views(self.run.read_map, submaps, list(anchors), self.config, outside, T_world_keyframe)
+        T_world_keyframe, exposures = (
+            None if name not in tensors else np.asarray(tensors[name], np.float64)
+            for name in ("T_world_keyframe", "exposure")
+        )
+        views = surface_views(
+            self.run.read_map, submaps, list(anchors), self.config, outside, T_world_keyframe, exposures
+        )
         return views, count_keyframes(submaps, outside)
 
     def surface(
@@ -95,8 +100,10 @@ class FusionInput:
         """Fuse renders of the map at the keyframes into a mesh in the run's world.
 
         Its vertices have the depth_std_m of the nearest opaque splat, if the run has measured it. Calls
-        `progress(done, total)` with keyframes. Raises RunError as `views` does; ConfigError unless voxel_m > 0.
+        `progress(done, total)` with keyframes. voxel_m None: `voxel_edge`. Raises RunError as `views` does; ConfigError
+        unless voxel_m > 0.
         """
+        voxel_m = voxel_edge(self.views()[0], self.config) if voxel_m is None else voxel_m
         views, total = self.views()
         mesh = fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
         field, std = self.run.read_splat_std() or (None, None)
