@@ -19,7 +19,7 @@ from sigmasplat.config.input import SensorModel as SensorModel
 from sigmasplat.config.text import differences as differences, override as override
 from sigmasplat.data import harmonics as harmonics, se3 as se3
 from sigmasplat.data.atlas import Atlas as Atlas
-from sigmasplat.data.camera import Camera as Camera, exposed as exposed
+from sigmasplat.data.camera import Camera as Camera, exposed as exposed, unexposed as unexposed
 from sigmasplat.data.camera_errors import sensor_said as sensor_said
 from sigmasplat.data.field import (
     ATTRIBUTES as ATTRIBUTES,
@@ -53,6 +53,7 @@ from sigmasplat.data.trajectory import (
 from sigmasplat.env import (
     import_optional as import_optional,
     install_extra as install_extra,
+    install_package as install_package,
     opencv as opencv,
 )
 from sigmasplat.errors import (
@@ -92,10 +93,12 @@ from sigmasplat.files.reading import (
     refuse_special as refuse_special,
 )
 from sigmasplat.final.fusion import (
+    AGREE_SHARE as AGREE_SHARE,
     FusionView as FusionView,
     Renderer as Renderer,
     count_keyframes as count_keyframes,
     fuse as fuse,
+    silhouettes as silhouettes,
     surface_views as surface_views,
     voxel_edge as voxel_edge,
 )

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from sigmasplat.commands import options
-from sigmasplat.commands.input_options import arg
+from sigmasplat.commands.input_options import arg, flag
 from sigmasplat.commands.options import prepare_torch, refuse_existing
 from sigmasplat.config.ranges import Range
 from sigmasplat.errors import ConfigError
@@ -20,13 +20,17 @@ MeshAxes = Annotated[Literal["y-up", "z-up", "y-down", "camera"] | None, arg(
 
 def make_mesh(
     run: options.RunPath, voxel_m: options.VoxelM = None,
-    triangles: Annotated[int, Range(0), arg("N", "largest number of triangles; 0 = no limit")] = 300_000,
+    triangles: Annotated[int | None, Range(0), arg(
+        "N", "largest number of triangles; 0 = no limit", "(default: 300000; with a texture 60000)",
+    )] = None,
+    texture: Annotated[bool, flag("colour the vertices of a GLB instead of giving it a texture")] = True,
     axes: MeshAxes = None, up: options.UpEdge = "auto",
     fill_gaps: Annotated[float, Range(0), arg(
         "M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
     )] = 0.0,
     out: Annotated[
-        Path | None, arg("FILE", "file to write: .glb, .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
+        Path | None,
+        arg("FILE", "file to write: .glb or .usdz (textured), .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
     ] = None,
     overwrite: options.Overwrite = False,
 ) -> int:  # fmt: skip
@@ -39,14 +43,21 @@ def make_mesh(
     from sigmasplat.plugins.outputs.axes import levelled, transform_to
     from sigmasplat.plugins.outputs.mesh_editing import decimated, filled
     from sigmasplat.plugins.outputs.mesh_files import check_ending, write_mesh
+    from sigmasplat.plugins.outputs.mesh_texture import textured
     from sigmasplat.plugins.outputs.run_reader import RunReader
+    from sigmasplat.render import FieldRenderer
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import MESH, RunFolder
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)
-    if target.suffix.lower() == ".glb" and axes not in (None, "y-up"):
-        raise ConfigError(f"a GLB has y up by definition, so --axes {axes} cannot be used; leave --axes out")
+    kind = target.suffix.lower()[1:].upper()
+    if kind in ("GLB", "USDZ") and axes not in (None, "y-up"):
+        raise ConfigError(f"a {kind} has y up by definition, so --axes {axes} cannot be used; leave --axes out")
+    if kind == "USDZ" and not texture:
+        raise ConfigError("a USDZ has a texture, so --no-texture cannot be used; leave it out, or write a GLB")
+    texture = texture and kind in ("GLB", "USDZ")
+    triangles = (60_000 if texture else 300_000) if triangles is None else triangles
     chosen: Axes = axes or ("y-up" if out else "camera")  # the run's own mesh.ply has the axes of its other files
     refuse_existing(out, overwrite)
     reader = RunReader(folder)
@@ -63,6 +74,12 @@ def make_mesh(
         if len(surface.faces) > triangles > 0:
             screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
             surface = decimated(surface, triangles)
+        surface = surface.with_faces(surface.areas() > 0.0)
+        if texture and len(surface.faces):
+            views, total = fusion_input.views()
+            with screen.counting("texture") as progress:
+                renderer = FieldRenderer(fusion_input.config.render, fusion_input.config.backend)
+                surface = textured(surface, views, total, renderer, progress)
         if chosen != "camera":
             R_floor_world, said, confirmed = levelled(reader, up)
             (screen.say if confirmed else screen.warn)(said)

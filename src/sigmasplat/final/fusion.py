@@ -64,7 +64,7 @@ def surface_views(
 
     read_field: returns the final map in the world, called if it is fused; anchors: T_world_submap of each submap;
     outside: the submaps that are not connected to the world, which are skipped; T_world_keyframe [K, 4, 4]: the poses
-    of all keyframes of all submaps, if the final map has moved them; exposures [F, 3, 2]: those of all frames, if known.
+    of all keyframes of all submaps, if the final map has moved them; exposures [F, 3, 2]: those of all frames.
     """
     if config.surface.depth == "map":
         yield from fusion_views(store, anchors, outside)
@@ -106,7 +106,7 @@ def _inside(store: SubmapStore, outside: Collection[int]) -> list[int]:
 def voxel_edge(views: Iterable[FusionView], config: Config) -> float:
     """Return the edge of a voxel for a surface of these views, m.
 
-    It is 1 cm, times the scale of the scene (VarSplat §7). With readings it is less where they show more: the width of a
+    It is 1 cm, times the scale of the scene (VarSplat §7). With readings it is less if they show more: the width of a
     working pixel at their median depth. It is not below half the standard deviation of a reading there, so that the
     truncation of 4 voxels contains most readings of one surface. It is more in a scene that would need more than
     `MOST_BLOCKS`. An unknown sensor is taken for one of structured light.

@@ -1,4 +1,4 @@
-"""Write surfaces as PLY or GLB with a normal and a colour per vertex, or as STL; read PLY.
+"""Write surfaces as PLY or GLB with normals and colours, as GLB or USDZ with a texture, or as STL; read PLY.
 
 PLY and GLB have depth_std_m too, if it is known; PLY also `filled`, the vertices that only close gaps. Unit: metre.
 
@@ -30,6 +30,8 @@ from sigmasplat.api import (
     replacing,
     to_bytes,
 )
+from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh
+from sigmasplat.plugins.outputs.mesh_usdz import usdz
 
 GRAY = 0.7
 Values = NDArray[np.floating]
@@ -38,26 +40,31 @@ TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 VERTICES, INDICES = 34962, 34963
 """Kinds of buffer views."""
 UNLIT = "KHR_materials_unlit"
-MATERIAL = {
+MATERIAL: dict[str, Any] = {
     "name": "recorded light",
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
     "doubleSided": True,
     "extensions": {UNLIT: {}},
 }
+TEXTURED = MATERIAL | {"pbrMetallicRoughness": MATERIAL["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}}
 
 
 def _glb(mesh: Mesh, note: str) -> bytes:
     """Return a mesh whose y axis points up, as glTF requires, as the bytes of a GLB file.
 
     POSITION and NORMAL are float32, COLOR_0 is linear in normalised uint16 with alpha 1. depth_std_m becomes
-    `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes.
+    `_DEPTH_STD_M`: glTF requires an underscore before the names of own attributes. A texture (sRGB by definition) takes
+    the place of the colours.
     """
-    attributes: dict[str, NDArray[Any]] = {
-        "POSITION": mesh.vertices.astype("<f4"), "NORMAL": _normals(mesh), "COLOR_0": _linear_colors(mesh)
-    }  # fmt: skip
+    attributes: dict[str, NDArray[Any]] = {"POSITION": mesh.vertices.astype("<f4"), "NORMAL": _normals(mesh)}
+    texture = mesh if isinstance(mesh, TexturedMesh) else None
+    attributes |= {"COLOR_0": _linear_colors(mesh)} if texture is None else {"TEXCOORD_0": texture.uv.astype("<f4")}
     if mesh.depth_std_m is not None:
         attributes["_DEPTH_STD_M"] = mesh.depth_std_m.astype("<f4")
     arrays = [*attributes.values(), mesh.faces.astype("<u4").ravel()]
+    views = len(arrays)
+    if texture is not None:
+        arrays.append(np.frombuffer(texture.image, np.uint8))
     document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "SigmaSplat"}, "scene": 0, "scenes": [{}]}
     if not all(array.size for array in arrays):  # glTF has no empty accessors
         return _packed(document, b"")
@@ -66,7 +73,7 @@ def _glb(mesh: Mesh, note: str) -> bytes:
         {"bufferView": i, "componentType": NUMBERS[array.dtype], "count": len(array)}
         | {"type": TYPES[1 if array.ndim == 1 else array.shape[1]]}
         | ({"normalized": True} if array.dtype == np.uint16 else {})
-        for i, array in enumerate(arrays)
+        for i, array in enumerate(arrays[:views])
     ]
     accessors[0] |= {end: [float(x) for x in getattr(mesh.vertices, end)(0)] for end in ("min", "max")}
     of_mesh = {"attributes": {key: i for i, key in enumerate(attributes)}, "material": 0, "indices": len(attributes)}
@@ -75,15 +82,17 @@ def _glb(mesh: Mesh, note: str) -> bytes:
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "surface"}],
         "meshes": [{"primitives": [of_mesh]}],
-        "materials": [MATERIAL],
+        "materials": [MATERIAL if texture is None else TEXTURED],
         "accessors": accessors,
         "bufferViews": [
             {"buffer": 0, "byteOffset": start, "byteLength": array.nbytes}
-            | {"target": VERTICES if i < len(attributes) else INDICES}
+            | ({"target": VERTICES if i < len(attributes) else INDICES} if i < views else {})
             for i, (start, array) in enumerate(zip(starts, arrays, strict=False))
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
+    if texture is not None:
+        document |= {"images": [{"mimeType": "image/jpeg", "bufferView": views}], "textures": [{"source": 0}]}
     return _packed(document, b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in arrays))
 
 
@@ -121,7 +130,7 @@ NOTE = "sigmasplat, unit metre"
 def write_mesh(path: Path, mesh: Mesh, note: str = NOTE) -> None:
     """Write a mesh in the format of the path's ending, atomically; the axes of the vertices stay as they are.
 
-    Vertices for GLB have y up, as glTF requires. note: one line of ASCII for the header of PLY and STL, for
+    Vertices for GLB and USDZ have y up, as glTF requires. note: one line of ASCII for the header of PLY and STL, for
     instance its axes. Raises RunError on an unknown ending or if the file cannot be written.
     """
     check_ending(path)
@@ -250,4 +259,4 @@ def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
     return to_bytes((np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors) * 255.0)
 
 
-_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl}
+_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl, ".usdz": usdz}
