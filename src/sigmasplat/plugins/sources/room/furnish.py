@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sigmasplat.api import Camera, Matrix
-from sigmasplat.plugins.sources.room.shapes import Kind, Rays, Shape
+from sigmasplat.plugins.sources.room.shapes import Kind, Shape
 from sigmasplat.plugins.sources.room.textures import (
     Color,
     Material,
@@ -291,6 +291,5 @@ def mask_of(ball: Shape, camera: Camera, T_world_camera: Matrix, depth_m: NDArra
     """Return the pixels [H, W] that show the ball in an image with exact depth [H, W] m."""
     rays = np.asarray(camera.rays(), np.float32).reshape(-1, 3).T
     R = T_world_camera[:3, :3].astype(np.float32)
-    cast = Rays(T_world_camera[:3, 3:].astype(np.float32), R @ rays)
-    hit = ball.first_hit(cast.origins, cast.directions).reshape(depth_m.shape)
+    hit = ball.first_hit(T_world_camera[:3, 3:].astype(np.float32), R @ rays).reshape(depth_m.shape)
     return np.isfinite(hit) & (hit <= depth_m + 1e-4)

@@ -13,6 +13,7 @@ from sigmasplat.plugins.sources.room.capture import Image
 from sigmasplat.plugins.sources.room.corridor import furnish_corridor
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HALF_Y_M, HEIGHT_M, PITCH_M, WALL_M, furnish_rooms
 from sigmasplat.plugins.sources.room.shapes import (
+    CUBE,
     Indices,
     Rays,
     Shape,
@@ -84,21 +85,22 @@ def light_room(number: int, shapes: Sequence[Shape]) -> Light:
     points = (lattice * np.float32(CELL_M)).reshape(3, -1) + start[:, None]
     opaque = [s for s in shapes if not s.material.glow and s.half.min() > 0.015 and s.half.max() > 0.1]
     shares = [_ambient_share(points, opaque), *(_lamp_share(points, opaque, light, which) for which in (0, 1))]
-    solid = _inside_any(points, opaque).reshape(counts)
-    return Light(light.room_x_m, side, np.stack([_filled(s.reshape(counts), solid) for s in shares]))
+    solid = np.any([(np.abs(shape.local(points)) < shape.half[:, None]).all(0) for shape in opaque], 0).reshape(counts)
+    # Points inside solids get the light of the nearest free point, so that surfaces are not too dark.
+    nearest = ndimage.distance_transform_edt(solid, return_distances=False, return_indices=True)
+    return Light(light.room_x_m, side, np.stack(shares).reshape(3, *counts)[:, *nearest])
 
 
 def _ambient_share(points: Floats, shapes: Sequence[Shape]) -> Floats:
-    signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     reach = np.float32(AMBIENT_REACH_M / np.sqrt(3.0))
-    free = [_free(points, np.broadcast_to(np.array([s], np.float32).T * reach, points.shape), shapes) for s in signs]
+    free = [_free(points, np.broadcast_to(np.array([s], np.float32).T * reach, points.shape), shapes) for s in CUBE]
     return np.asarray(np.mean(free, 0, dtype=np.float32))
 
 
 def _lamp_share(points: Floats, shapes: Sequence[Shape], light: Light, which: int) -> Floats:
     """Return the share of sample points of the lamp (0) or window (1) visible from each lattice point."""
     at, spread = ((LAMP_M, (0.45, 0.45, 0.0)), (WINDOW_M, (0.6, 0.0, 0.42)))[which]
-    signs = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1) if y == z or which == 0]
+    signs = [(x, y, z) for x, y, z in CUBE if y == z or which == 0]
     targets = [light.place(at) + np.array([[s[k] * spread[k]] for k in range(3)], np.float32) for s in signs[:4]]
     return np.asarray(np.mean([_free(points, t - points, shapes) for t in targets], 0, dtype=np.float32))
 
@@ -113,21 +115,6 @@ def _free(points: Floats, segments: Floats, shapes: Sequence[Shape]) -> Floats:
         among = np.flatnonzero(near & (free > 0))
         free[among[shape.first_hit(points[:, among], segments[:, among]) <= 1.0]] = 0.0
     return free
-
-
-def _inside_any(points: Floats, shapes: Sequence[Shape]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    inside = np.zeros(points.shape[1], bool)
-    for shape in shapes:
-        inside |= (np.abs(shape.local(points)) < shape.half[:, None]).all(0)
-    return inside
-
-
-def _filled(shares: Floats, solid: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Floats:
-    """Give points inside solids the light of the nearest free point, so that surfaces are not too dark."""
-    if solid.all() or not solid.any():
-        return shares
-    nearest = ndimage.distance_transform_edt(solid, return_distances=False, return_indices=True)
-    return np.asarray(shares[tuple(nearest)])
 
 
 SUBPIXELS = np.array([[-0.375, -0.125, 0.375, 0.125], [-0.125, 0.375, 0.125, -0.375]], np.float32)
@@ -154,10 +141,8 @@ def build_scene(rooms: int, seed: int, corridor: bool = False, wall: int = 0) ->
     """Build and light the rooms, about a second per room, or as many sections of a corridor or a wall; the result is
     cached."""
     built = furnished(rooms, seed, corridor, wall)
-    if corridor or wall:
-        return RoomScene([shape for shapes in built for shape in shapes], [even_light(k) for k in range(rooms)])
-    neighbours = [built[max(k - 1, 0)] + built[k] if k else built[k] for k in range(rooms)]
-    lights = [light_room(k, shapes) for k, shapes in enumerate(neighbours)]
+    even, before = corridor or wall, [[], *built]
+    lights = [even_light(k) if even else light_room(k, before[k] + built[k]) for k in range(rooms)]
     return RoomScene([shape for shapes in built for shape in shapes], lights)
 
 
@@ -198,31 +183,29 @@ def _edges(faces: Indices) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Ray hits: parameter t [N] (inf for a miss), face number [N], normals [3, N], paint [3, N] in display values, and
-    glow, mirror and gloss [N] of the material."""
+    """Ray hits: parameter t [N] (inf for a miss), face number [N], normals [3, N], paint [3, N] in display values;
+    material [3, N]: glow, mirror and gloss."""
 
     t: Floats
     faces: Indices
     normals: Floats
     paint: Floats
-    glow: Floats
-    mirror: Floats
-    gloss: Floats
+    material: Floats
 
 
 def _intersect(scene: RoomScene, rays: Rays, windows: Windows | None, focal_px: float) -> Hits:
     t, hit = cast_rays(scene.shapes, rays, windows)
-    n = len(t)
-    normals, paint, (glow, mirror, gloss) = np.zeros((3, n), np.float32), np.zeros((3, n), np.float32), np.zeros((3, n))
-    faces = np.full(n, -1, np.intp)
+    normals, paint, material = np.zeros((3, 3, len(t)), np.float32)
+    faces = np.full(len(t), -1, np.intp)
     for k in np.unique(hit[hit >= 0]):
         at, shape = np.flatnonzero(hit == k), scene.shapes[k]
+        made = shape.material
         directions, origins = rays.directions[:, at], rays.origins[:, at] if rays.origins.shape[1] > 1 else rays.origins
         normals[:, at], u, v = surface_at(shape, origins + directions * t[at])
-        paint[:, at] = shape.material.texture(u, v, _pixel_m(directions, normals[:, at], t[at], focal_px))
+        paint[:, at] = made.texture(u, v, _pixel_m(directions, normals[:, at], t[at], focal_px))
         faces[at] = 32 * k + _face_number(shape, normals[:, at])
-        glow[at], mirror[at], gloss[at] = shape.material.glow, shape.material.mirror, shape.material.gloss
-    return Hits(t, faces, normals, paint, *(m.astype(np.float32) for m in (glow, mirror, gloss)))
+        material[:, at] = np.array([[made.glow], [made.mirror], [made.gloss]])
+    return Hits(t, faces, normals, paint, material)
 
 
 def _pixel_m(directions: Floats, normals: Floats, t: Floats, focal_px: float) -> Floats:
@@ -236,7 +219,7 @@ def _face_number(shape: Shape, normals: Floats) -> Indices:
     """Number the smooth parts of one shape [N]: six faces of a box, caps and side of a drum, one part of a ball."""
     if shape.kind == "ball":
         return np.zeros(normals.shape[1], np.intp)
-    n = np.rint(shape.to_local_axes(normals)).astype(np.intp) + 1
+    n = np.rint(shape.to_room_axes(normals, -1)).astype(np.intp) + 1
     return np.asarray(n[2] if shape.kind == "drum" else n[0] + 3 * n[1] + 9 * n[2])
 
 
@@ -249,13 +232,13 @@ def _colors(
     mirrored = rays.directions - 2.0 * dot(hits.normals, rays.directions) * hits.normals
     falling, highlight = _light(scene, points, hits, normalised(mirrored))
     # Display values are about the square root of light, so paint is squared first and the sum is rooted.
-    linear = hits.paint**2 * (hits.glow + (1.0 - hits.glow) * falling) + highlight
-    shiny = np.flatnonzero(hits.mirror)
+    glow, mirror, _ = hits.material
+    linear = hits.paint**2 * (glow + (1.0 - glow) * falling) + highlight
+    shiny = np.flatnonzero(mirror)
     if len(shiny) and bounces:
         away = Rays(points[:, shiny] + np.float32(2e-3) * hits.normals[:, shiny], mirrored[:, shiny])
         reflected, _, _ = _colors(scene, away, None, 0.5 * focal_px, bounces - 1)
-        share = hits.mirror[shiny]
-        linear[:, shiny] = (1.0 - share) * linear[:, shiny] + share * reflected**2
+        linear[:, shiny] = (1.0 - mirror[shiny]) * linear[:, shiny] + mirror[shiny] * reflected**2
     return np.sqrt(np.clip(linear, 0.0, 1.0)).astype(np.float32), hits.t, hits.faces
 
 
@@ -267,9 +250,9 @@ def _light(scene: RoomScene, points: Floats, hits: Hits, mirrored: Floats) -> tu
     for k in np.unique(room):
         at, light = np.flatnonzero(room == k), scene.lights[int(k)]
         falling[:, at], shares = light.at(points[:, at], hits.normals[:, at])
-        glossy = np.flatnonzero(hits.gloss[at])
+        glossy = np.flatnonzero(hits.material[2, at])
         for lamp, share in zip((LAMP_M, WINDOW_M), shares[:, glossy], strict=True):
             towards = normalised(light.place(lamp) - points[:, at[glossy]])
             lobe = np.maximum(dot(towards, mirrored[:, at[glossy]]), 0.0) ** 24
-            highlight[at[glossy]] += hits.gloss[at[glossy]] * share * lobe
+            highlight[at[glossy]] += hits.material[2, at[glossy]] * share * lobe
     return falling, highlight

@@ -8,6 +8,7 @@ Triangles of all shapes are the true surface, including hidden faces.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -19,6 +20,7 @@ from sigmasplat.plugins.sources.room.textures import Floats, Material
 Indices = NDArray[np.intp]
 Kind = Literal["box", "ball", "drum"]
 
+CUBE = list(product((-1, 1), repeat=3))
 MIN_RAY_PARAMETER = 1e-3
 """Hits with a smaller ray parameter are on the surface where the ray starts."""
 
@@ -33,22 +35,21 @@ class Shape:
     yaw_rad: float
     material: Material
 
-    def to_local_axes(self, vectors: Floats) -> Floats:
-        """Rotate room vectors [3, ...] to the shape's axes."""
-        return _rotated_about_z(vectors, -self.yaw_rad)
-
-    def to_room_axes(self, vectors: Floats) -> Floats:
-        """Rotate vectors [3, ...] from the shape's axes to the room."""
-        return _rotated_about_z(vectors, self.yaw_rad)
+    def to_room_axes(self, v: Floats, sign: int = 1) -> Floats:
+        """Rotate vectors [3, ...] from the shape's axes to the room's; back with sign −1."""
+        if self.yaw_rad == 0.0:
+            return v
+        c, s = np.float32(np.cos(sign * self.yaw_rad)), np.float32(np.sin(sign * self.yaw_rad))
+        return np.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], np.broadcast_to(v[2], v[0].shape)])
 
     def local(self, points: Floats) -> Floats:
         """Return room points [3, N] in the shape's frame, metres."""
-        return self.to_local_axes(points - self.center[:, None])
+        return self.to_room_axes(points - self.center[:, None], -1)
 
     def first_hit(self, origins: Floats, directions: Floats) -> Floats:
         """Return the ray parameter [N] where rays enter, inf for a miss; origins [3, 1] or [3, N]."""
         o = self.local(origins) / self.half[:, None]
-        d = self.to_local_axes(directions) / self.half[:, None]
+        d = self.to_room_axes(directions, -1) / self.half[:, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             enter, leave = _INTERVALS[self.kind](o, d)
             hit = (enter < leave) & (enter > MIN_RAY_PARAMETER)
@@ -56,8 +57,7 @@ class Shape:
 
     def corners(self) -> NDArray[np.float64]:
         """Return the 8 corners of the bounding box, room frame [8, 3]."""
-        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
-        return (self.to_room_axes((signs * self.half).T).T + self.center).astype(np.float64)
+        return (self.to_room_axes((np.array(CUBE, np.float32) * self.half).T).T + self.center).astype(np.float64)
 
 
 def dot(a: Floats, b: Floats) -> Floats:
@@ -71,15 +71,8 @@ def normalised(v: Floats) -> Floats:
     return (v / np.maximum(np.sqrt(dot(v, v)), 1e-9)).astype(np.float32)
 
 
-def _rotated_about_z(v: Floats, angle_rad: float) -> Floats:
-    if angle_rad == 0.0:
-        return v
-    c, s = np.float32(np.cos(angle_rad)), np.float32(np.sin(angle_rad))
-    return np.stack([c * v[0] - s * v[1], s * v[0] + c * v[1], np.broadcast_to(v[2], v[0].shape)])
-
-
 def _slab(o: Floats, d: Floats) -> tuple[Floats, Floats]:
-    """Return the interval of t with |o + t d| ≤ 1 for one coordinate."""
+    """Return the interval of t with |o + t d| ≤ 1 for each coordinate."""
     per_unit = 1.0 / np.where(d == 0.0, np.float32(1e-9), d)
     middle, half = -o * per_unit, np.abs(per_unit)
     return middle - half, middle + half
@@ -95,9 +88,8 @@ def _within_unit(o: Floats, d: Floats) -> tuple[Floats, Floats]:
 
 
 def _box_interval(o: Floats, d: Floats) -> tuple[Floats, Floats]:
-    (enter_x, leave_x), (enter_y, leave_y), (enter_z, leave_z) = (_slab(o[k], d[k]) for k in range(3))
-    enter = np.maximum(np.maximum(enter_x, enter_y), enter_z)
-    return enter, np.minimum(np.minimum(leave_x, leave_y), leave_z)
+    enter, leave = _slab(o, d)
+    return enter.max(0), leave.min(0)
 
 
 def _drum_interval(o: Floats, d: Floats) -> tuple[Floats, Floats]:

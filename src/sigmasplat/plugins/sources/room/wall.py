@@ -6,7 +6,7 @@ from sigmasplat.api import Matrix
 from sigmasplat.plugins.sources.room.capture import pose
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HEIGHT_M, PITCH_M, WALL_M, Room
 from sigmasplat.plugins.sources.room.shapes import Shape
-from sigmasplat.plugins.sources.room.textures import Texture, plain, tiles
+from sigmasplat.plugins.sources.room.textures import plain, tiles
 
 AWAY_M, STEP_M, MARGIN_M = 1.2, 0.07, 2.0
 """Distance of the camera from the wall, its motion from frame to frame, and what the wall is longer than the way."""
@@ -22,17 +22,13 @@ def wall_sections(frames: int) -> int:
     return int(np.ceil((frames * STEP_M + 2 * MARGIN_M) / PITCH_M))
 
 
-def paint_of(number: int, seed: int) -> Texture:
-    """Return a paint of `PAINTS`, from 1 on."""
-    paints = plain(COLOR, 0.5, 0.12, seed), tiles(COLOR, JOINT, TILE_M), plain(COLOR, 0.0)
-    return dict(zip(PAINTS, paints, strict=True))[PAINTS[number - 1]]
-
-
 def furnish_wall(count: int, seed: int, paint: int) -> list[list[Shape]]:
-    """Build a wall as long as `count` sections, painted as `PAINTS` says; return its shapes, all as of one section."""
+    """Build a wall as long as `count` sections, painted as `PAINTS` says, from 1 on; return its shapes, all as of one
+    section."""
+    paints = plain(COLOR, 0.5, 0.12, 1000 * seed), tiles(COLOR, JOINT, TILE_M), plain(COLOR, 0.0)  # as in PAINTS
     whole, middle_x = Room(0, seed), (count - 1) * PITCH_M / 2
     half = PITCH_M * count / 2, WALL_M / 2, HEIGHT_M
-    whole.place("box", (middle_x, WALL_M / 2, HEIGHT_M / 2), half, paint_of(paint, 1000 * seed))
+    whole.place("box", (middle_x, WALL_M / 2, HEIGHT_M / 2), half, paints[paint - 1])
     return [whole.shapes]
 
 
