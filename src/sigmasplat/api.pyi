@@ -99,6 +99,7 @@ from sigmasplat.final.fusion import (
     count_keyframes as count_keyframes,
     fuse as fuse,
     silhouettes as silhouettes,
+    surface_of as surface_of,
     surface_views as surface_views,
     voxel_edge as voxel_edge,
 )

@@ -1,5 +1,6 @@
 """Mesh files: they are read back by our reader and by handmade readers; other files are refused."""
 
+import io
 import json
 import shutil
 import struct
@@ -9,10 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sigmasplat.data.mesh import Mesh
 from sigmasplat.errors import RunError, SourceError
 from sigmasplat.plugins.outputs.mesh_files import read_mesh, write_mesh
+from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh
 
 
 def some_mesh(colors: bool = True) -> Mesh:
@@ -156,7 +159,17 @@ def node(package: str, program: str, *arguments: str) -> Any:
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
-@pytest.mark.parametrize("mesh", [some_mesh(), some_mesh(colors=False), EMPTY], ids=["coloured", "gray", "empty"])
+def with_texture() -> Mesh:
+    mesh, file = some_mesh(), io.BytesIO()
+    Image.new("RGB", (64, 64), (200, 100, 50)).save(file, "JPEG")
+    return TexturedMesh(mesh.vertices, mesh.faces, uv=np.abs(mesh.vertices[:, :2]) / 9, image=file.getvalue())
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [some_mesh(), some_mesh(colors=False), EMPTY, with_texture()],
+    ids=["coloured", "gray", "empty", "textured"],
+)
 def test_khronos_validator_accepts_the_glb(tmp_path: Path, mesh: Mesh) -> None:
     write_mesh(tmp_path / "a.glb", mesh)
     issues = node("gltf-validator", GLTF_VALIDATOR, str(tmp_path / "a.glb"))

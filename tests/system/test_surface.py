@@ -264,6 +264,7 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     for refused, words in (
         (["--out", str(tmp_path / "a.fbx")], "give a name that ends in .ply, .glb, .stl"),
         (["--out", str(tmp_path / "a.glb"), "--axes", "z-up"], "a GLB has y up by definition"),
+        (["--out", str(tmp_path / "a.usdz"), "--no-texture"], "a USDZ has a texture"),
         (["--triangles", "-1"], "--triangles must be at least 0"),
         (["--out", str(tmp_path / "run" / "mesh.ply")], "exists; give another --out"),
         (["--voxel-m", "-1"], "--voxel-m must be above 0"),

@@ -45,18 +45,12 @@ def make_mesh(
     from sigmasplat.plugins.outputs.mesh_files import check_ending, write_mesh
     from sigmasplat.plugins.outputs.mesh_texture import textured
     from sigmasplat.plugins.outputs.run_reader import RunReader
-    from sigmasplat.render import FieldRenderer
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import MESH, RunFolder
 
     screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
     check_ending(target)
-    kind = target.suffix.lower()[1:].upper()
-    if kind in ("GLB", "USDZ") and axes not in (None, "y-up"):
-        raise ConfigError(f"a {kind} has y up by definition, so --axes {axes} cannot be used; leave --axes out")
-    if kind == "USDZ" and not texture:
-        raise ConfigError("a USDZ has a texture, so --no-texture cannot be used; leave it out, or write a GLB")
-    texture = texture and kind in ("GLB", "USDZ")
+    texture = _has_texture(target, texture, axes)
     triangles = (60_000 if texture else 300_000) if triangles is None else triangles
     chosen: Axes = axes or ("y-up" if out else "camera")  # the run's own mesh.ply has the axes of its other files
     refuse_existing(out, overwrite)
@@ -76,10 +70,8 @@ def make_mesh(
             surface = decimated(surface, triangles)
         surface = surface.with_faces(surface.areas() > 0.0)
         if texture and len(surface.faces):
-            views, total = fusion_input.views()
             with screen.counting("texture") as progress:
-                renderer = FieldRenderer(fusion_input.config.render, fusion_input.config.backend)
-                surface = textured(surface, views, total, renderer, progress)
+                surface = textured(surface, *fusion_input.views(), fusion_input.config, progress)
         if chosen != "camera":
             R_floor_world, said, confirmed = levelled(reader, up)
             (screen.say if confirmed else screen.warn)(said)
@@ -87,3 +79,15 @@ def make_mesh(
         write_mesh(target, surface, f"sigmasplat, unit metre, axes {chosen}")
         screen.say(f"axes {chosen}, {len(surface.vertices):,} vertices, {len(surface.faces):,} triangles: {target}")
     return 0
+
+
+def _has_texture(target: Path, texture: bool, axes: "Axes | None") -> bool:
+    """Return whether a file gets a texture. Raises ConfigError for options that its format does not have."""
+    kind = target.suffix.lower()[1:].upper()
+    if kind not in ("GLB", "USDZ"):
+        return False
+    if axes not in (None, "y-up"):
+        raise ConfigError(f"a {kind} has y up by definition, so --axes {axes} cannot be used; leave --axes out")
+    if kind == "USDZ" and not texture:
+        raise ConfigError("a USDZ has a texture, so --no-texture cannot be used; leave it out, or write a GLB")
+    return texture

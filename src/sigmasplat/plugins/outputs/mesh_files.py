@@ -11,7 +11,9 @@ room is seen from inside and from outside, hence `doubleSided`.
 import json
 import os
 import struct
+import zipfile
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -31,7 +33,6 @@ from sigmasplat.api import (
     to_bytes,
 )
 from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh
-from sigmasplat.plugins.outputs.mesh_usdz import usdz
 
 GRAY = 0.7
 Values = NDArray[np.floating]
@@ -254,9 +255,77 @@ def _stl(mesh: Mesh, note: str) -> bytes:
     return header + len(rows).to_bytes(4, "little") + rows.tobytes()
 
 
+USDA = """#usda 1.0
+( defaultPrim = "surface"
+  metersPerUnit = 1
+  upAxis = "Y" )
+def Xform "surface" ( kind = "component" )
+{
+    def Mesh "mesh" ( prepend apiSchemas = ["MaterialBindingAPI"] )
+    {
+        uniform bool doubleSided = 1
+        uniform token subdivisionScheme = "none"
+        float3[] extent = [%s]
+        int[] faceVertexCounts = %s
+        int[] faceVertexIndices = %s
+        point3f[] points = [%s]
+        texCoord2f[] primvars:st = [%s] ( interpolation = "vertex" )
+        rel material:binding = </surface/material>
+    }
+    def Material "material"
+    {
+        token outputs:surface.connect = </surface/material/light.outputs:surface>
+        def Shader "light"
+        {
+            uniform token info:id = "UsdPreviewSurface"
+            color3f inputs:diffuseColor = (0, 0, 0)
+            color3f inputs:emissiveColor.connect = </surface/material/texture.outputs:rgb>
+            float inputs:roughness = 1
+            int inputs:useSpecularWorkflow = 1
+            token outputs:surface
+        }
+        def Shader "texture"
+        {
+            uniform token info:id = "UsdUVTexture"
+            asset inputs:file = @texture.jpg@
+            token inputs:sourceColorSpace = "sRGB"
+            float2 inputs:st.connect = </surface/material/place.outputs:result>
+            float3 outputs:rgb
+        }
+        def Shader "place"
+        {
+            uniform token info:id = "UsdPrimvarReader_float2"
+            string inputs:varname = "st"
+            float2 outputs:result
+        }
+    }
+}
+"""
+
+
+def _usdz(mesh: Mesh, note: str) -> bytes:
+    """Return a textured mesh whose y axis points up as USDZ: a zip file without compression whose parts begin at
+    multiples of 64 bytes. The texture is emitted and nothing is reflected. Raises RunError without a texture."""
+    if not isinstance(mesh, TexturedMesh):
+        raise RunError("a USDZ needs a surface with a texture, found none; write a GLB, PLY or STL")
+    ends = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
+    st = mesh.uv * (1, -1) + (0, 1)  # USD counts from the lower left corner
+    points = (", ".join(f"({', '.join(f'{x:.7g}' for x in row)})" for row in of.tolist()) for of in (mesh.vertices, st))
+    scene = USDA % (str(list(map(tuple, ends.tolist())))[1:-1], [3] * len(mesh.faces), mesh.faces.ravel().tolist(),
+                    *points)  # fmt: skip
+    file = BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in (("surface.usda", scene.encode()), ("texture.jpg", mesh.image)):
+            part = zipfile.ZipInfo(name)  # of 1980: the same surface gives the same bytes
+            fill = -(file.tell() + 30 + len(name) + 4) % 64  # the headers of the part and of its extra field
+            part.extra = struct.pack("<HH", 0x1986, fill) + bytes(fill)
+            archive.writestr(part, content)
+    return file.getvalue()
+
+
 def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
     """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
     return to_bytes((np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors) * 255.0)
 
 
-_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl, ".usdz": usdz}
+_FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl, ".usdz": _usdz}

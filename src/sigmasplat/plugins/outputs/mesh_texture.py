@@ -1,12 +1,10 @@
-"""Give a mesh a texture: one atlas of charts by xatlas, and for each of its texels the mean colour of the keyframes.
+"""Give a mesh a texture: an atlas of charts by xatlas, whose texels have the colours of the keyframes' images.
 
-The colours are those of the recorded images in the exposure of the map, hence without seams, or, without images,
-renders of the map. A view counts by the fourth power of its pixels per area of the surface: nearly the best one alone,
-without borders between views. A texel that no view shows has the colours of the vertices.
+The images are taken in the exposure of the map, so there are no seams; without images, renders of the map are used.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field as dataclass_field, replace
+from dataclasses import dataclass, field as dataclass_field
 from io import BytesIO
 
 import numpy as np
@@ -17,69 +15,71 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from sigmasplat.api import (
     AGREE_SHARE,
     Camera,
+    Config,
     ConfigError,
+    FieldRenderer,
     FusionView,
     Matrix,
     Mesh,
     Progress,
-    Renderer,
     install_package,
     mesh_depth,
-    no_progress,
     se3,
     silhouettes,
+    surface_of,
     unexposed,
 )
 
 SIZES, TEXEL_M, FILLED = (2048, 4096), 0.005, 0.75
-"""Edges of an atlas; the larger one if a texel of the smaller one would be larger than this on the surface, which takes
-about this share of the atlas."""
+"""Edges of an atlas: the larger one if texels of the smaller one, of which this share is used, would be larger."""
 PADDING, JPEG_QUALITY = 2, 90
 FACES_AT_ONCE = 1024
 """Faces that xatlas divides into charts at once: its time grows faster than their number."""
-POWER, LEAST_COSINE, HIDDEN_SHARE, LEAST_WEIGHT = 4, 0.2, 0.02, 1e-20
-"""Of views: the power of pixels per area; steeper ones do not count, nor points behind the surface by this share of the
-depth; the weight of the colours of the vertices."""
+POWER, LEAST_COSINE, HIDDEN_SHARE = 4, 0.2, 0.02
+"""A view counts by this power of its pixels per area, nearly the best one alone but without borders; not if it is
+steeper, or for points behind the surface by this share of the depth."""
+Floats = NDArray[np.float32]
+Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class TexturedMesh(Mesh):
-    """A mesh with a texture: uv [V, 2] in [0, 1], from the upper left corner of its image; image: the file, JPEG."""
+    """A mesh with uv [V, 2] in [0, 1], from the upper left corner of the texture; image: the texture as JPEG file."""
 
-    uv: NDArray[np.float32] = dataclass_field(default_factory=lambda: np.empty((0, 2), np.float32))
+    uv: Floats = dataclass_field(default_factory=lambda: np.empty((0, 2), np.float32))
     image: bytes = b""
 
 
-def textured(mesh: Mesh, views: Iterable[FusionView], total: int, renderer: Renderer, progress: Progress = no_progress
-             ) -> TexturedMesh:  # fmt: skip
+def textured(mesh: Mesh, views: Iterable[FusionView], total: int, config: Config, progress: Progress) -> TexturedMesh:
     """Return a mesh in the world with a texture of these views; vertices at the edges of charts are doubled.
 
-    Calls `progress(views done, total)`. Raises ConfigError if xatlas is not installed.
+    Texels that no view shows have the colours of the vertices. Views without images are rendered with the settings of
+    `config`. Calls `progress(views done, total)`. Raises ConfigError if xatlas is not installed.
     """
     size = SIZES[float(mesh.areas().sum()) > FILLED * (SIZES[0] * TEXEL_M) ** 2]
-    mesh, uv = unwrapped(mesh, size)
-    texels = _Texels.of(mesh, uv, size)
-    sums = np.zeros((len(texels.faces), 4), np.float32)
-    sums[:, :3], sums[:, 3] = LEAST_WEIGHT * texels.mean_of(mesh, mesh.colors), LEAST_WEIGHT
+    mesh, uv = _unwrapped(mesh, size)
+    places, faces, shares = _texels(mesh, uv, size)
+
+    def at_texels(values: Floats) -> Floats:
+        return np.asarray(np.einsum("tk,tkc->tc", shares, values[mesh.faces[faces]]), np.float32)
+
+    points, sums = at_texels(mesh.vertices), np.zeros((len(faces), 4), np.float32)
     for done, at in enumerate(views, 1):
-        rows, colors, weight = _seen(at, mesh, texels, renderer)
+        rows, colors, weight = _seen(at, mesh, points, faces, config)
         sums[rows] += np.column_stack([colors * weight[:, None], weight])
         progress(done, total)
-    image = np.zeros((size * size, 3), np.uint8)
-    image[texels.places] = np.rint(255.0 * sums[:, :3] / sums[:, 3:]).clip(0, 255)
-    empty = np.ones(size * size, bool)
-    empty[texels.places] = False
+    colors = np.full_like(mesh.vertices, 0.7) if mesh.colors is None else mesh.colors
+    shown = np.where(sums[:, 3:] > 0, sums[:, :3] / np.maximum(sums[:, 3:], 1e-30), at_texels(colors))
+    image, empty = np.zeros((size * size, 3), np.uint8), np.ones(size * size, bool)
+    image[places], empty[places] = np.rint(255.0 * shown).clip(0, 255), False
     nearest = distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True)
     file = BytesIO()
     Image.fromarray(image.reshape(size, size, 3)[tuple(nearest)]).save(file, "JPEG", quality=JPEG_QUALITY)
-    return TexturedMesh(
-        mesh.vertices, mesh.faces, mesh.colors, mesh.depth_std_m, mesh.filled, uv=uv, image=file.getvalue()
-    )
+    return TexturedMesh(mesh.vertices, mesh.faces, mesh.colors, mesh.depth_std_m, mesh.filled, uv, file.getvalue())
 
 
-def unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, NDArray[np.float32]]:
-    """Return the mesh with the vertices at the edges of charts doubled, and the place of each vertex in an atlas of
-    size² texels [V, 2]. Raises ConfigError if xatlas is not installed."""
+def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Floats]:
+    """Return the mesh with the vertices at the edges of charts doubled, and uv [V, 2] in an atlas of size² texels."""
     try:
         import xatlas
     except ImportError as problem:
@@ -89,118 +89,79 @@ def unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, NDArray[np.float32]]:
         ) from problem
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
     packing.resolution, packing.padding, packing.bilinear = size, PADDING, True
-    parts = _parts(mesh.corners.mean(1))
-    for part in parts:
-        used, faces = np.unique(mesh.faces[part], return_inverse=True)
-        atlas.add_mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.uint32))
+    used = []
+    for part in _parts(mesh.corners.mean(1)):
+        rows, faces = np.unique(mesh.faces[part], return_inverse=True)
+        atlas.add_mesh(mesh.vertices[rows], faces.reshape(-1, 3).astype(np.uint32))
+        used.append(rows)
     atlas.generate(xatlas.ChartOptions(), packing)
-    found, start = [atlas[i] for i in range(len(parts))], 0
-    rows, faces_of, uv = [], [], []
-    for part, (vertices, faces, at) in zip(parts, found, strict=True):
-        rows.append(np.unique(mesh.faces[part])[vertices])
-        faces_of.append(faces.astype(np.int32) + np.int32(start))
-        uv.append(np.clip(at, 0.0, 1.0))
-        start += len(vertices)
-    row = np.concatenate(rows)
+    parts = [atlas[i] for i in range(len(used))]
+    row = np.concatenate([rows[part[0]] for rows, part in zip(used, parts, strict=True)])
+    starts = np.cumsum([0, *(len(part[0]) for part in parts)])
+    faces = np.concatenate([part[1] + start for part, start in zip(parts, starts, strict=False)])
     colors, std, filled = (None if of is None else of[row] for of in (mesh.colors, mesh.depth_std_m, mesh.filled))
-    doubled = Mesh(mesh.vertices[row], np.concatenate(faces_of), colors, std, filled)
-    return doubled, np.concatenate(uv).astype(np.float32)
+    uv = np.concatenate([part[2] for part in parts]).clip(0.0, 1.0)
+    return Mesh(mesh.vertices[row], faces.astype(np.int32), colors, std, filled), uv.astype(np.float32)
 
 
-def _parts(centers: Matrix) -> list[NDArray[np.int64]]:
-    """Divide points [N, 3] at the median of their longest axis until each part has at most `FACES_AT_ONCE`."""
-    open_parts, parts = [np.arange(len(centers))], []
-    while open_parts:
-        part = open_parts.pop()
-        if len(part) <= FACES_AT_ONCE:
-            parts.append(part)
-            continue
-        order = np.argsort(centers[part, np.ptp(centers[part], axis=0).argmax()], kind="stable")
-        open_parts += [np.sort(part[half]) for half in np.array_split(order, 2)]
+def _parts(centers: Matrix) -> list[Indices]:
+    """Halve points [N, 3] along their longest axis until no part has more than `FACES_AT_ONCE`."""
+    parts = [np.arange(len(centers))]
+    while max(map(len, parts)) > FACES_AT_ONCE:
+        axes = [np.ptp(centers[part], axis=0).argmax() for part in parts]
+        ordered = [part[np.argsort(centers[part, axis], kind="stable")] for part, axis in zip(parts, axes, strict=True)]
+        parts = [half for part in ordered for half in np.array_split(part, 2)]
     return parts
 
 
-@dataclass(frozen=True, eq=False)
-class _Texels:
-    """The T texels of an atlas that show a face, in the order of the faces: their places in the image, faces,
-    barycentric coordinates [T, 3], positions [T, 3] m and normals [T, 3]."""
-
-    places: NDArray[np.int64]
-    faces: NDArray[np.int64]
-    shares: NDArray[np.float32]
-    points: NDArray[np.float32]
-    normals: NDArray[np.float32]
-
-    @staticmethod
-    def of(mesh: Mesh, uv: NDArray[np.float32], size: int) -> "_Texels":
-        """Draw the charts as a flat mesh one metre in front of a camera whose pixels are the texels."""
-        flat = Mesh(np.column_stack([uv, np.ones(len(uv), np.float32)]).astype(np.float32), mesh.faces)
-        _, shown = mesh_depth(flat, Camera(size, size, size, size, -0.5, -0.5), np.eye(4))
-        places = np.flatnonzero(shown.ravel() >= 0)
-        places = places[np.argsort(shown.ravel()[places], kind="stable")]
-        faces = shown.ravel()[places].astype(np.int64)
-        at = (np.stack([places % size, places // size], 1) + 0.5) / size
-        a, b, c = np.moveaxis(uv[mesh.faces[faces]].astype(np.float64), 1, 0)
-        whole = _cross(b - a, c - a)
-        whole[whole == 0.0] = 1.0
-        v, w = _cross(at - a, c - a) / whole, _cross(b - a, at - a) / whole
-        shares = np.stack([1.0 - v - w, v, w], 1).astype(np.float32)
-        texels = _Texels(places, faces, shares, np.empty(0, np.float32), np.empty(0, np.float32))
-        points, normals = (
-            texels.mean_of(mesh, values.astype(np.float32)) for values in (mesh.vertices, mesh.normals())
-        )
-        return replace(texels, points=points, normals=normals)
-
-    def mean_of(self, mesh: Mesh, values: NDArray[np.float32] | None) -> NDArray[np.float32]:
-        """Interpolate values of the vertices [V, 3] at the texels [T, 3]; gray without values."""
-        if values is None:
-            return np.full((len(self.faces), 3), 0.7, np.float32)
-        return np.asarray(np.einsum("tk,tkc->tc", self.shares, values[mesh.faces[self.faces]]), np.float32)
+def _texels(mesh: Mesh, uv: Floats, size: int) -> tuple[Indices, Indices, Floats]:
+    """Return the texels of an atlas that show a face: places in the image [T], faces [T], shares of their corners
+    [T, 3]. The charts are drawn as a flat mesh 1 m in front of a camera whose pixels are the texels."""
+    flat = Mesh(np.column_stack([uv, np.ones(len(uv), np.float32)]), mesh.faces)
+    _, shown = mesh_depth(flat, Camera(size, size, size, size, -0.5, -0.5), np.eye(4))
+    places = np.flatnonzero(shown >= 0)
+    faces = shown.ravel()[places].astype(np.int64)
+    corners = np.moveaxis(flat.corners[faces], 1, 0) - np.column_stack([places % size + 0.5, places // size + 0.5,
+                                                                        np.full(len(places), size)]) / size  # fmt: skip
+    areas = np.stack([np.cross(corners[k - 2], corners[k - 1])[:, 2] for k in range(3)], 1)
+    whole = areas.sum(1, keepdims=True)
+    return places, faces, np.divide(areas, whole, out=np.full(areas.shape, 1 / 3), where=whole != 0).astype(np.float32)
 
 
-def _cross(a: Matrix, b: Matrix) -> Matrix:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-
-
-def _seen(
-    at: FusionView, mesh: Mesh, texels: _Texels, renderer: Renderer
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the texels that a view shows [S], their colours there [S, 3] and their weights [S].
+def _seen(at: FusionView, mesh: Mesh, points: Floats, faces: Indices, config: Config) -> tuple[Indices, Floats, Floats]:
+    """Return which of the texels at `points` [T, 3] a view shows [S], their colours there [S, 3] and weights [S].
 
     Texels beside silhouettes do not count, nor where a reading contradicts the surface: something moved there.
     """
-    T, camera = se3.inverse(at.T_world_camera), at.camera
+    camera, T, image, of = at.camera, se3.inverse(at.T_world_camera), *_image(at, config)
     depth_m, face = mesh_depth(mesh, camera, T)
     known = (face >= 0) & ~silhouettes(depth_m)
     if at.picture is not None:
-        reading_m = at.picture.depth_m
-        known &= (reading_m == 0) | (np.abs(reading_m - depth_m) < AGREE_SHARE * depth_m)
+        off_m = np.abs(at.picture.depth_m - depth_m)
+        known &= (at.picture.depth_m == 0) | (off_m < AGREE_SHARE * depth_m)
+    a, b, c = np.moveaxis(mesh.corners @ T[:3, :3].T + T[:3, 3], 1, 0)
+    normal = np.cross(b - a, c - a)
+    cosine = np.abs((normal * a).sum(1)) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(a, axis=1) + 1e-30)
     shown = np.zeros(len(mesh.faces), bool)
     shown[face[known]] = True
-    rows = np.flatnonzero(shown[texels.faces])
-    points = texels.points[rows] @ T[:3, :3].T + T[:3, 3]
-    z, away = np.maximum(points[:, 2], 1e-6), np.linalg.norm(points, axis=1)
-    u, v = (focal * points[:, k] / z + center for k, focal, center in ((0, camera.fx, camera.cx),
-                                                                       (1, camera.fy, camera.cy)))  # fmt: skip
-    cosine = np.abs(np.einsum("sk,sk->s", texels.normals[rows] @ T[:3, :3].T, points)) / away
-    column, row = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
-    use = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (cosine > LEAST_COSINE)
-    row, column = row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)
-    use &= known[row, column] & (z < (1.0 + HIDDEN_SHARE) * depth_m[row, column])
-    image, of = _image(at, renderer)
-    u, v = (of.fx * points[use, 0] / z[use] + of.cx, of.fy * points[use, 1] / z[use] + of.cy)
-    colors = np.stack([map_coordinates(image[..., k], [v, u], order=1, mode="nearest") for k in range(3)], 1)
-    weight = (cosine[use] / z[use] ** 2) ** POWER
-    return rows[use], colors.astype(np.float32), weight.astype(np.float32)
+    rows = np.flatnonzero((shown & (cosine > LEAST_COSINE))[faces])
+    x, y, z = T[:3, :3] @ points[rows].T + T[:3, 3:]
+    u, v = (np.rint(f * s / np.maximum(z, 1e-6) + middle).astype(np.int64).clip(-1, most) for f, s, middle, most in (
+        (camera.fx, x, camera.cx, camera.width), (camera.fy, y, camera.cy, camera.height)))  # fmt: skip
+    nearest_m = np.pad(np.where(known, depth_m, np.float32(0.0)), 1)[v + 1, u + 1]
+    use = (z > 0) & (z < (1.0 + HIDDEN_SHARE) * nearest_m)
+    x, y, z, rows = x[use], y[use], z[use], rows[use]
+    pixels = [of.fy * y / z + of.cy, of.fx * x / z + of.cx]
+    colors = np.stack([map_coordinates(image[..., k], pixels, order=1, mode="nearest") for k in range(3)], 1)
+    return rows, colors, ((cosine[faces[rows]] / z**2) ** POWER).astype(np.float32)
 
 
-def _image(at: FusionView, renderer: Renderer) -> tuple[NDArray[np.float32], Camera]:
+def _image(at: FusionView, config: Config) -> tuple[Floats, Camera]:
     """Return the colours of a view [H, W, 3] in the exposure of the map, in [0, 1], and their camera."""
     if at.picture is None:
-        seen = renderer(at.field, at.camera, at.T_camera_field)
-        color, alpha = (np.asarray(values.cpu(), np.float32) for values in (seen.color, seen.alpha))
-        return np.asarray(color / np.maximum(alpha, np.float32(0.5))[..., None], np.float32), at.camera
-    photo = at.picture.photo
-    color = at.picture.unit_color if photo is None else photo.color().astype(np.float32) / np.float32(255.0)
-    camera = at.camera if photo is None else photo.camera
+        seen = FieldRenderer(config.render, config.backend)(at.field, at.camera, at.T_camera_field)
+        return surface_of(seen, config)[1], at.camera
+    photo, color, camera = at.picture.photo, at.picture.unit_color, at.camera
+    if photo is not None:
+        color, camera = photo.color().astype(np.float32) / np.float32(255.0), photo.camera
     return color if at.exposure is None else unexposed(color, at.exposure), camera
