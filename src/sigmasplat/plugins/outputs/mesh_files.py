@@ -255,54 +255,6 @@ def _stl(mesh: Mesh, note: str) -> bytes:
     return header + len(rows).to_bytes(4, "little") + rows.tobytes()
 
 
-USDA = """#usda 1.0
-( defaultPrim = "surface"
-  metersPerUnit = 1
-  upAxis = "Y" )
-def Xform "surface" ( kind = "component" )
-{
-    def Mesh "mesh" ( prepend apiSchemas = ["MaterialBindingAPI"] )
-    {
-        uniform bool doubleSided = 1
-        uniform token subdivisionScheme = "none"
-        float3[] extent = [%s]
-        int[] faceVertexCounts = %s
-        int[] faceVertexIndices = %s
-        point3f[] points = [%s]
-        texCoord2f[] primvars:st = [%s] ( interpolation = "vertex" )
-        rel material:binding = </surface/material>
-    }
-    def Material "material"
-    {
-        token outputs:surface.connect = </surface/material/light.outputs:surface>
-        def Shader "light"
-        {
-            uniform token info:id = "UsdPreviewSurface"
-            color3f inputs:diffuseColor = (0, 0, 0)
-            color3f inputs:emissiveColor.connect = </surface/material/texture.outputs:rgb>
-            float inputs:roughness = 1
-            int inputs:useSpecularWorkflow = 1
-            token outputs:surface
-        }
-        def Shader "texture"
-        {
-            uniform token info:id = "UsdUVTexture"
-            asset inputs:file = @texture.jpg@
-            token inputs:sourceColorSpace = "sRGB"
-            float2 inputs:st.connect = </surface/material/place.outputs:result>
-            float3 outputs:rgb
-        }
-        def Shader "place"
-        {
-            uniform token info:id = "UsdPrimvarReader_float2"
-            string inputs:varname = "st"
-            float2 outputs:result
-        }
-    }
-}
-"""
-
-
 def _usdz(mesh: Mesh, note: str) -> bytes:
     """Return a textured mesh whose y axis points up as USDZ: a zip file without compression whose parts begin at
     multiples of 64 bytes. The texture is emitted and nothing is reflected. Raises RunError without a texture."""
@@ -311,8 +263,9 @@ def _usdz(mesh: Mesh, note: str) -> bytes:
     ends = np.stack([mesh.vertices.min(0), mesh.vertices.max(0)])
     st = mesh.uv * (1, -1) + (0, 1)  # USD counts from the lower left corner
     points = (", ".join(f"({', '.join(f'{x:.7g}' for x in row)})" for row in of.tolist()) for of in (mesh.vertices, st))
-    scene = USDA % (str(list(map(tuple, ends.tolist())))[1:-1], [3] * len(mesh.faces), mesh.faces.ravel().tolist(),
-                    *points)  # fmt: skip
+    extent, counts = str(list(map(tuple, ends.tolist())))[1:-1], [3] * len(mesh.faces)
+    form = Path(__file__).with_name("mesh.usda").read_text(encoding="utf-8")
+    scene = form % (extent, counts, mesh.faces.ravel().tolist(), *points)
     file = BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in (("surface.usda", scene.encode()), ("texture.jpg", mesh.image)):
