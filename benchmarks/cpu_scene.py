@@ -41,11 +41,6 @@ def peak_mib() -> float:
     return round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1)
 
 
-def view_bytes(view: CpuView) -> int:
-    """Return the memory held by the buffers of a view."""
-    return view.raster.bytes + 4 * 2 * (view.sums.numel() + 2 * view.alpha.numel())
-
-
 def measure(request: Request) -> dict[str, Any]:
     """Time all operations on every instruction set and number of threads; the first set with all threads is main."""
     scene = make_scene(request.path, request.index, request.splats, request.width, request.seed)
@@ -54,7 +49,7 @@ def measure(request: Request) -> dict[str, Any]:
     set_up(*main)
     works = Works(scene)
     timings = [_entry(*main, time_works(works, request.runs, once=False))]
-    memory = {"before_mib": before, "peak_mib": peak_mib(), "view_mib": round(view_bytes(works.view) / 2**20, 1)}
+    memory = {"before_mib": before, "peak_mib": peak_mib()}
     stages = works.stages(request.runs)
     timings[0]["works"] |= time_works(works, request.runs, once=True)
     for isa in request.isas:

@@ -97,11 +97,11 @@ def work_done(figures: Figures) -> Section:
     rows = []
     for s in figures["scenes"]:
         forward, millions = median_ms(main_works(s), "forward_all"), s["pairs"] / 1e6
-        numbers = [1e6 * millions / s["splats"], ratio(millions, forward), s["memory"]["view_mib"]]
+        numbers = [1e6 * millions / s["splats"], ratio(millions, forward)]
         process = " → ".join(significant(s["memory"][when]) for when in ("before_mib", "peak_mib"))
         pairs = f"{significant(millions)} ± {significant(s['pairs_standard_error'] / 1e6, 1)}"
         rows.append([named(s), pairs, *(significant(x) for x in numbers), process])
-    columns = ["splats, image", "pairs, M", "pairs per splat", "G pairs/s forward", "buffers, MiB", "process, MiB"]
+    columns = ["splats, image", "pairs, M", "pairs per splat", "G pairs/s forward", "process, MiB"]
     pixels = figures["scenes"][0]["pairs_sampled_pixels"] if figures["scenes"] else 0
     pairs = f"Pairs of a pixel and a contributing splat, extrapolated from {pixels} random pixels (± standard error)"
     note = f"{pairs}. Process: peak memory after making the map, and after all operations."

@@ -25,8 +25,7 @@ from tables import Section
 from sigmasplat.config import Config
 from sigmasplat.config.find_preset import default_preset, preset
 from sigmasplat.errors import SourceError
-from sigmasplat.graph.sensor_fit import Pair, fitted
-from sigmasplat.graph.sensor_times import TIMES
+from sigmasplat.graph.sensor_fit import TIMES, Pair, fitted
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.run.calibrate import aligned_pairs, measure_sensor
 from sigmasplat.types import completed

@@ -165,7 +165,7 @@ def scene(splats: int, width: int, ms: float, **changes: Any) -> dict[str, Any]:
     ]
     size = {"splats": splats, "width": width, "height": width * 3 // 4}
     pairs = {"pairs": 3e6, "pairs_standard_error": 1e5, "pairs_sampled_pixels": 400}
-    memory = {"before_mib": 300.0, "peak_mib": 350.0, "view_mib": 9.0}
+    memory = {"before_mib": 300.0, "peak_mib": 350.0}
     return {**size, **pairs, "memory": memory, "timings": timings, "peer": None, **changes}
 
 

@@ -15,8 +15,17 @@ from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.fit.align import Alignment, Pair as Aligned, align, normal_equations
 from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pyramid import Pyramid
-from sigmasplat.graph.sensor_fit import BIAS, LEAST_PAIRS, NEIGHBOURS, Pair, Term, fitted, newton_step
-from sigmasplat.graph.sensor_times import TIMES as THREE, measured
+from sigmasplat.graph.sensor_fit import (
+    BIAS,
+    LEAST_PAIRS,
+    NEIGHBOURS,
+    TIMES as THREE,
+    Pair,
+    Term,
+    fitted,
+    measured,
+    newton_step,
+)
 from sigmasplat.types import completed
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")

@@ -4,7 +4,7 @@ Plug-ins add other devices."""
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -37,15 +37,8 @@ CPU = replace(
 OWN = {"reference": TORCH, "cpu": CPU}
 
 
-class OnBackend(Protocol):
-    """An object that names its backend: a view or a pyramid."""
-
-    @property
-    def backend(self) -> str: ...
-
-
-def fits_of(on: OnBackend) -> DeviceFits:
-    """Return the functions that the backend of a view or a pyramid offers to the fits."""
+def fits_of(on: Any) -> DeviceFits:
+    """Return the functions that the backend (`on.backend`) of a view or a pyramid offers to the fits."""
     return OWN[on.backend] if on.backend in OWN else _added(on.backend)
 
 

@@ -20,8 +20,7 @@ from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import picture_images
 from sigmasplat.graph.pose_graph import ROUGHLY, PoseGraph, factorised, minimise, most_chi2
-from sigmasplat.graph.sensor_fit import Pair
-from sigmasplat.graph.sensor_times import FIRST_MEASURED, MOST_MEASURED, measured
+from sigmasplat.graph.sensor_fit import FIRST_MEASURED, MOST_MEASURED, Pair, measured
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.tracking.pose_validation import confirmed

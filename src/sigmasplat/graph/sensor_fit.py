@@ -3,6 +3,9 @@
 A pair of images agrees best at the true numbers. The cost of aligning a pair, as a function of them, is its lowest cost
 over all motions (a profile). The sum over the pairs is minimised by Newton steps; the covariance is that of an
 M-estimator whose terms share images (sandwich, as in `fit.align`). No truth is used.
+
+When the sensor reads depth and rows is found so: late depth contradicts colour where the camera changes its speed, and
+rows that are read one after another bend an image where it moves.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtri
 
-from sigmasplat.data.readout import Readout
+from sigmasplat.data.readout import UNKNOWN_TIMES, Readout, SensorTimes
 from sigmasplat.fit.align import align
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.types import Matrix, Task
@@ -158,3 +161,34 @@ def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
     of_groups = np.array([left[groups == group].sum(0) for group in np.unique(groups)])
     n = len(of_groups)
     return np.asarray(step), np.asarray(inverse @ (of_groups.T @ of_groups) @ inverse) * n / max(n - len(step), 1)
+
+
+# ---- the times of the sensor ----
+
+FIRST_MEASURED, MOST_MEASURED = 60, 60
+"""Alignments before the first measurement, and pairs of one."""
+
+
+def read(pair: Pair, times: SensorTimes) -> tuple[Pyramid, Pyramid]:
+    """Return the images of a pair as a sensor with these times has read them."""
+    return pair.reference.read(times.read(pair.of_reference)), pair.live.read(times.read(pair.of_live))
+
+
+TIMES = Parameters(np.full(3, 0.01), lambda pair, s: read(pair, SensorTimes(*s.tolist(), std_s=(0.0, 0.0, 0.0))))
+"""Depth after colour, read-out of depth, and of colour, s. In 10 ms, images of a hand-held camera move by some pixels;
+the longest step is the time of one frame."""
+
+
+def measured(pairs: Sequence[Pair]) -> Task[SensorTimes]:
+    """Measure the times, in slices of one pair and round.
+
+    Returns all zero, without standard deviations, if the images do not show that anything is read late. The images of a
+    pair may be small: half of the working size takes a quarter of the time and gives the same times.
+    """
+    fit = yield from fitted(pairs, TIMES)
+    return times_of(fit) if fit.sure else UNKNOWN_TIMES
+
+
+def times_of(fit: Fit) -> SensorTimes:
+    """Return the times where the pairs agree best; unknown if they are neither sure nor refuted."""
+    return UNKNOWN_TIMES if fit.std is None else SensorTimes(*fit.values.tolist(), std_s=tuple(fit.std.tolist()))

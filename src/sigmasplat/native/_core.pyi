@@ -191,8 +191,6 @@ class Harmonics:
 
 class Rasteriser:
     def __init__(self) -> None: ...
-    @property
-    def bytes(self) -> int: ...
     def blend_forward(
         self,
         means2d: Array,

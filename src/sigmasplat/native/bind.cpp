@@ -103,7 +103,6 @@ public:
     Rasteriser() : kernels(active), context(kernels->create()) {}
     ~Rasteriser() { kernels->destroy(context); }
     Rasteriser(const Rasteriser&) = delete;
-    size_t bytes() const { return kernels->bytes(context); }
 
     void blend_forward(ConstFloats means2d, ConstFloats conics, ConstFloats z, ConstFloats radii, ConstFloats opacities,
                        ConstFloats features, int width, int height, float alpha_min, float stop, Maybe<ConstFloats> reference,
@@ -298,7 +297,6 @@ NB_MODULE(_core, m) {
              nb::arg("last_step"), nb::arg("degree"), nb::arg("step"), nb::arg("rate"));
     nb::class_<Rasteriser>(m, "Rasteriser")
         .def(nb::init<>())
-        .def_prop_ro("bytes", &Rasteriser::bytes)
         .def("blend_forward", &Rasteriser::blend_forward, nb::arg("means2d"), nb::arg("conics"), nb::arg("z"), nb::arg("radii"), nb::arg("opacities"),
              nb::arg("features"), nb::arg("width"), nb::arg("height"), nb::arg("alpha_min"), nb::arg("stop"), nb::arg("reference").none(), nb::arg("sums"),
              nb::arg("moment").none(), nb::arg("alpha"), nb::arg("median_id").none(), nb::arg("median_weight").none(), nb::arg("dominant_id").none(), nb::arg("dominant_weight").none())

@@ -21,5 +21,4 @@ template <class T> struct Buffer {
     }
     T& operator[](size_t i) { return data[i]; }
     const T& operator[](size_t i) const { return data[i]; }
-    size_t bytes() const { return capacity * sizeof(T); }
 };

@@ -63,7 +63,6 @@ struct Kernels {
     PadSize pad;
     Context* (*create)();
     void (*destroy)(Context*);
-    size_t (*bytes)(const Context*);
     void (*project_forward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,
                             float* means2d, float* conics, float* z, float* radii, float* slopes);
     void (*project_backward)(const float* view, const float* means, const float* quats, const float* scales, int64_t n,

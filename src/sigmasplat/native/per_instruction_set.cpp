@@ -34,7 +34,6 @@ template <int N> struct std_int { static constexpr int value = N; };
 
 Context* create() { return reinterpret_cast<Context*>(new Render); }
 void destroy(Context* c) { delete reinterpret_cast<Render*>(c); }
-size_t bytes(const Context* c) { return reinterpret_cast<const Render*>(c)->bytes(); }
 
 #define SIGMA_NAME_(x) #x
 #define SIGMA_NAME(x) SIGMA_NAME_(x)
@@ -46,7 +45,7 @@ extern const Kernels table;
 const Kernels table = {
     SIGMA_NAME(SIGMASPLAT_ISA),
     {TILE_WIDTH, TILE_HEIGHT, W},
-    create, destroy, bytes,
+    create, destroy,
     project_forward, project_backward, blend_forward, blend_backward, gather_planes,
     view_forward, view_backward, view_step, adam_settle, view_backward_pose, view_visible,
     ssim_target, ssim, mapping_losses, tracking_loss, reference_maps, align_steps, align_images, &image_table,

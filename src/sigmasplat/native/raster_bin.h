@@ -33,7 +33,6 @@ struct Walk {                                         // all splats of a block t
     Buffer<int> entry;
     alignas(64) float pairs[ALPHA_CHUNK][2 * W];
     void reserve(size_t n) { alpha.reserve(n); weight.reserve(n); gain.reserve(n); entry.reserve(n); }
-    size_t bytes() const { return alpha.bytes() + weight.bytes() + gain.bytes() + entry.bytes(); }
 };
 struct Center { float u, v; };
 struct Scratch {                                      // buffers of one thread for its tile
@@ -46,10 +45,6 @@ struct Scratch {                                      // buffers of one thread f
     Walk walk;
     int counts[BLOCKS];
     size_t list_capacity = 0;
-    size_t bytes() const {
-        return rows.bytes() + records.bytes() + centers.bytes() + masks.bytes() + lists.bytes() + sorted.bytes() + walk.bytes()
-               + sizeof(*this);
-    }
 };
 
 
@@ -101,12 +96,6 @@ struct Render {                                       // what a forward pass sto
     const Geometry& geometry(int64_t i) const { return *reinterpret_cast<const Geometry*>(&rows[size_t(i) * row]); }
     size_t padded_width() const { return size_t(tiles_x) * TILE_WIDTH; }
     size_t plane() const { return padded_width() * tiles_y * TILE_HEIGHT; }
-    size_t bytes() const {
-        size_t b = rows.bytes() + depths.bytes() + boxes.bytes() + partials.bytes() + tiles_of.bytes() + items.bytes() + histogram.bytes()
-                   + tile_begin.bytes() + median_gradient.bytes();
-        for (int t = 0; t < threads; t++) b += scratch[t].bytes();
-        return b;
-    }
 };
 
 // Transpose W columns at a time, first geometry and then features, into the next W floats of the rows of live splats.

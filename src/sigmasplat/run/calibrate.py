@@ -15,8 +15,7 @@ from sigmasplat.data.readout import SensorTimes
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.graph.graph_errors import CALIBRATION
-from sigmasplat.graph.sensor_fit import LEVEL, NEIGHBOURS, Fit, Pair, Parameters, fitted
-from sigmasplat.graph.sensor_times import TIMES, read, times_of
+from sigmasplat.graph.sensor_fit import LEVEL, NEIGHBOURS, TIMES, Fit, Pair, Parameters, fitted, read, times_of
 from sigmasplat.input.source import Source
 from sigmasplat.system.slam import Slam
 from sigmasplat.tracking.moving.free_space import on_image
