@@ -133,14 +133,14 @@ def refine(
     """
     final, mapping, losses, done = config.final, refinement(config), list[float](), 0
     clock = clock or Clock(final.seconds)
-    own_rates = final.lr_means_last or final.lr_log_scales or (final.lr_factor, final.lr_decay) != (1.0, 1.0)
+    own = final.lr_means_last or final.lr_log_scales
+    changes_rates = own or (final.lr_factor, final.lr_decay, final.beta2) != (1.0, 1.0, BETA2)
     prune_by_weight(field, view, keyframes, final.prune_weight_px)
     while done < final.iterations and not clock.is_over:
         until_event = min(every - done % every for every in (final.prune_every, final.sh_every))
         steps = range(done, min(done + until_event, final.iterations))
         degree = min(final.sh_degree, done // final.sh_every)
-        changed = own_rates or final.beta2 != BETA2
-        rates = decaying(mapping, final, done, clock, config.render.scene_scale) if changed else None
+        rates = decaying(mapping, final, done, clock, config.render.scene_scale) if changes_rates else None
         drawn = _draw(keyframes, steps, config, random, progress, clock, view)
         losses += (fitted := fit_field(field, view, drawn, mapping, schedule=rates, degree=degree).losses)
         done += len(fitted)
