@@ -149,6 +149,7 @@ def test_a_browser_opens_at_the_best_view_and_floats_until_a_person_moves_it(app
     assert page.camera.fov == pytest.approx(0.8)
     np.testing.assert_allclose(app.server.initial_camera.position, opening.T_world_camera[:3, 3])
     wait_until(lambda: turned(page, opening) > 0.3)
+    assert not app.panel.path.value, "nothing is drawn over the first look"
     assert app.panel.floating.value and turned(page, opening) < 2.1
     before = page.camera.position
     page.camera.position = before + 0.2

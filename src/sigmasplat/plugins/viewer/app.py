@@ -139,7 +139,7 @@ class ViewerApp:
         if self._is_new("path", (path, row, shown)):
             self.scene.show_lines("path", lines.path_segments(path, row) if shown else None)
             at = min(row, len(path) - 1)
-            current = path.T_world_camera[at] if len(path) and path.inside[at] else None
+            current = path.T_world_camera[at] if shown and len(path) and path.inside[at] else None
             self.scene.show_current_camera(snapshot.camera, current)
         truth = snapshot.true_positions if self.panel.true_path.value else None
         if self._is_new("true path", truth is not None and snapshot):

@@ -58,11 +58,11 @@ class ControlPanel:
             self.follow: Any = gui.add_checkbox(
                 "follow the camera", False, visible=False, hint="stay behind the camera while it records"
             )
-            self.path = gui.add_checkbox("its path", True, hint="red: where it did not know its position")
+            self.path = gui.add_checkbox("its path", False, hint="red: where it did not know its position")
             self.keyframes = gui.add_checkbox(
                 "images kept", False, hint="the map is made from these; click one to go there and see it"
             )
-            self.true_path = gui.add_checkbox("its true path", True, visible=False, hint="blue: measured by others")
+            self.true_path = gui.add_checkbox("its true path", False, visible=False, hint="blue: measured by others")
 
     @property
     def layer(self) -> str | None:
@@ -73,7 +73,7 @@ class ControlPanel:
     def adapt(self, frames: int, live: bool, truth_known: bool) -> None:
         """Adapt the controls to the snapshot; a timeline at its end stays there while frames are added."""
         if not (self.follow.visible or self.floating.visible):  # the first one
-            self.floating.value = not live
+            self.floating.value, self.path.value = not live, live
         last = max(frames - 1, 1)
         at_end = self.row.value >= self.row.max
         if last != self.row.max:
