@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.config import RECORDED_POSES, InputConfig
+from sigmasplat.config import RECORDED_POSES
 from sigmasplat.data import se3
 from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.data.frame import Frame
@@ -41,9 +41,8 @@ class Corrected(Subset):
     """Another source without the errors of its stated camera. Raises SourceError for a live camera."""
 
     def __init__(self, whole: Source, errors: CameraErrors) -> None:
-        if whole.live:
-            raise SourceError("camera_errors of input.calibrate are for recordings; remove them from its file")
-        super().__init__(whole, InputConfig())
+        refused = "camera_errors of input.calibrate are for recordings; remove them from its file"
+        super().__init__(whole, refuse_live=refused)
         self._errors, self.camera = errors, errors.camera(whole.camera)
 
     def frame(self, i: int) -> Frame:
@@ -62,9 +61,8 @@ class Masked(Subset):
     """
 
     def __init__(self, whole: Source, folder: Path) -> None:
-        if whole.live:
-            raise SourceError(f"{folder}: masks are for recordings only; record the camera, then run the recording")
-        super().__init__(whole, InputConfig())
+        refused = f"{folder}: masks are for recordings only; record the camera, then run the recording"
+        super().__init__(whole, refuse_live=refused)
         self.origins = {name: origin for name, origin in self.origins.items() if name != "transparency"}
         if not folder.is_dir():
             raise SourceError(f"no such folder: {folder}; give the folder of the masks, one image for each frame")
@@ -165,15 +163,15 @@ class Posed(Subset):
     """
 
     def __init__(self, whole: Source, given: str, scale: float = 1.0, depth_scale: float = 1.0) -> None:
-        if whole.live:
-            raise SourceError(f"{given}: poses are for recordings only; record the camera, then run the recording")
-        super().__init__(whole, InputConfig())
+        refused = f"{given}: poses are for recordings only; record the camera, then run the recording"
+        super().__init__(whole, refuse_live=refused)
         found = _poses_of(whole, given)
         if given != RECORDED_POSES and not given.lower().endswith((".json", "images.txt")):
             axes = Origin("camera to world, x right, y down, z ahead", ASSUMED, "convert the file")
             self.origins = self.origins | {"poses": axes}
         self._depth_scale = np.float32(depth_scale if whole.predicted_depth else 1.0)
-        self._poses = [_scaled(T, scale) for T in found if T is not None]
+        self._poses = np.stack([T for T in found if T is not None])
+        self._poses[:, :3, 3] *= scale
         self._indices = [i for i, T in enumerate(found) if T is not None]
         self.skipped += [f"{whole.name}, frame {i}: no pose in {given}" for i, T in enumerate(found) if T is None]
 
@@ -184,12 +182,6 @@ class Posed(Subset):
 
     def depth_of(self, i: int) -> NDArray[np.float32]:
         return super().depth_of(i) * self._depth_scale
-
-
-def _scaled(T: Matrix, scale: float) -> Matrix:
-    T = T.copy()
-    T[:3, 3] *= scale
-    return T
 
 
 def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
@@ -217,10 +209,8 @@ def _poses_of(whole: Source, given: str) -> list[Matrix | None]:
 def _by_time(whole: Source, path: Trajectory) -> tuple[list[Matrix | None], str]:
     """Return the pose of each frame, and what is wrong if there is none; so does `_by_name`."""
     times_s = np.array([whole.timestamp_s(i) for i in range(len(whole))])
-    found: list[Matrix | None] = [None] * len(whole)
-    for i, row in associate(times_s, path.timestamps_s):
-        found[i] = path.T_world_camera[row]
-    return found, (
+    rows = dict(associate(times_s, path.timestamps_s).tolist())
+    return [path.T_world_camera[rows[i]] if i in rows else None for i in range(len(whole))], (
         f": no pose is within {MAX_GAP_S:g} s of a frame (poses {path.timestamps_s.min():.3f} … "
         f"{path.timestamps_s.max():.3f} s, frames {times_s.min():.3f} … {times_s.max():.3f} s); "
         "use the clock of the recording, in seconds"

@@ -95,18 +95,10 @@ def still_bias(times_s: Values, angular_velocity_rad_s: Values) -> Values:
     """
     seconds = np.floor(times_s - times_s[0]).astype(np.int64)
     starts = np.flatnonzero(np.diff(seconds, prepend=-1))
-    means = [still_mean(rates) for rates in np.split(angular_velocity_rad_s, starts[1:])]
-    still = [mean for mean in means if mean is not None]
+    samples = [rates for rates in np.split(angular_velocity_rad_s, starts[1:]) if len(rates) >= STILL_SAMPLES]
+    means = [rates.mean(0) for rates in samples if rates.std(0).max() < STILL_NOISE_RAD_S]
+    still = [mean for mean in means if np.linalg.norm(mean) < MAX_BIAS_RAD_S]
     return np.median(still, axis=0) if still else np.zeros(3)
-
-
-def still_mean(angular_velocity_rad_s: Values) -> Values | None:
-    """Return the mean [3] of the samples [M, 3] of one second, rad/s; None if the gyroscope was not still."""
-    rates = angular_velocity_rad_s
-    if len(rates) < STILL_SAMPLES or rates.std(0).max() >= STILL_NOISE_RAD_S:
-        return None
-    mean: Values = rates.mean(0)
-    return mean if np.linalg.norm(mean) < MAX_BIAS_RAD_S else None
 
 
 GRAVITY_M_S2 = 9.81

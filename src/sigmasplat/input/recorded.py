@@ -20,7 +20,15 @@ from sigmasplat.errors import SourceError
 from sigmasplat.input.calibration import ASSUMED, MEASURED, Calibration, Origin, resolve_calibration
 from sigmasplat.input.depth_meaning import MOST_PIXELS, NORMALISED, SAMPLES, ends_at_one, meaning_of, thinned
 from sigmasplat.input.given import SAME_SHAPE
-from sigmasplat.input.images import FRAMES_PER_SECOND, color_origins, image_size, pair_images, read_color, read_depth
+from sigmasplat.input.images import (
+    FRAMES_PER_SECOND,
+    Video,
+    color_origins,
+    image_size,
+    pair_images,
+    read_color,
+    read_depth,
+)
 from sigmasplat.input.imu import Accelerometer, Gyroscope
 from sigmasplat.input.intrinsics import intrinsics_beside
 from sigmasplat.input.lists import poses_beside
@@ -101,11 +109,11 @@ Value = TypeVar("Value")
 
 @dataclass(frozen=True)
 class ImagePair:
-    """The colour and the depth file of one frame, its time, how much later the depth is, in seconds, and the image of
-    the confidence of its readings (`read_depth`).
+    """The colour and the depth file of one frame, its time, how much later the depth is, in seconds, the image of the
+    confidence of its readings (`read_depth`), and the video and the number of its colour image, if it is in a video.
 
-    Formats whose images are not separate files (members of an archive, frames of a video, messages of a bag) derive
-    from this class and override the readers; the paths then only name the images in error messages.
+    Formats whose images are not separate files (members of an archive, messages of a bag) derive from this class and
+    override the readers; the paths then only name the images in error messages.
     """
 
     timestamp_s: float
@@ -113,10 +121,11 @@ class ImagePair:
     depth: Path
     depth_late_s: float = field(default=0.0, kw_only=True)
     confidence: Path | None = field(default=None, kw_only=True)
+    video: tuple[Video, int] | None = field(default=None, kw_only=True)
 
     def read_color(self) -> NDArray[Any]:
         """Read 8-bit RGB [H, W, 3], or gray of more bits as stored [H, W]. Raises SourceError naming `color`."""
-        return read_color(self.color)
+        return self.video[0].frame(self.video[1]) if self.video else read_color(self.color)
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 = no reading; whole numbers are divided. Raises SourceError naming `depth`."""
@@ -129,7 +138,7 @@ class ImagePair:
     def sizes(self) -> tuple[Size, Size]:
         """Return (width, height) of colour and of depth in pixels. Raises SourceError naming the unreadable file."""
         height, width = self.read_depth(1.0).shape
-        return image_size(self.color), (width, height)
+        return self.video[0].size if self.video else image_size(self.color), (width, height)
 
 
 class RecordedSource(Source):

@@ -161,7 +161,12 @@ class Rectification:
         self.beyond_m = float("inf")  # from here on, a value is no reading
         lens = calibration.distortion if settings.undistort else None
         depth_lens = calibration.depth_distortion if settings.undistort else None
-        depth_camera = self._depth_camera(name, settings)
+        if settings.register_depth == "on" and calibration.depth_camera is None:
+            raise SourceError(
+                f"{name}: depth cannot be registered, the depth camera is unknown; "
+                "give depth_camera and T_color_depth in calibration.json"
+            )
+        depth_camera = calibration.depth_camera if registers_depth(calibration, settings) else None
         self.camera = calibration.camera
         self._color_lens = _undistortion(calibration.camera, lens)
         self._depth_lens = self._color_lens
@@ -172,16 +177,6 @@ class Rectification:
                 self.camera = color.resized(width, round(color.height * width / color.width))
             self._depth_lens = _undistortion(depth_camera, depth_lens)
             self._registration = DepthRegistration(depth_camera, self.camera, calibration.T_color_depth)
-
-    def _depth_camera(self, name: str, settings: InputConfig) -> Camera | None:
-        """Return the camera that depth is moved from, None if depth is not moved."""
-        known = self.calibration.depth_camera
-        if settings.register_depth == "on" and known is None:
-            raise SourceError(
-                f"{name}: depth cannot be registered, the depth camera is unknown; "
-                "give depth_camera and T_color_depth in calibration.json"
-            )
-        return known if registers_depth(self.calibration, settings) else None
 
     @property
     def moves_depth(self) -> bool:

@@ -47,6 +47,7 @@ FACTS = (
     "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts", "path_by",
 )  # fmt: skip
 """What a source that wraps another one has in common with it."""
+ALL_FRAMES = InputConfig()
 CORRECTED = ("orientation", "gray", "farthest depth")
 """Origins of how images are changed when they are read."""
 
@@ -230,8 +231,10 @@ class Wrapped(Source):
 class Subset(Wrapped):
     """Part of another source: a time span, every `stride`-th frame, at most `limit`; frames are numbered from 0."""
 
-    def __init__(self, whole: Source, settings: InputConfig) -> None:
-        """Select the frames. Raises SourceError if no frame is left."""
+    def __init__(self, whole: Source, settings: InputConfig = ALL_FRAMES, refuse_live: str = "") -> None:
+        """Select the frames. Raises SourceError if no frame is left, or `refuse_live` if it is a live camera."""
+        if refuse_live and whole.live:
+            raise SourceError(refuse_live)
         super().__init__(whole)
         self._indices: Sequence[int] = _within(whole, settings)[:: settings.stride][: settings.limit or None]
         if not len(self._indices):

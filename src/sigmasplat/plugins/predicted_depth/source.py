@@ -119,12 +119,8 @@ class WithPredictedDepth(Subset):
     """
 
     def __init__(self, whole: Source, settings: InputConfig) -> None:
-        if whole.live:
-            raise SourceError(
-                f"{settings.predicted_depth}: predicted depth is for recordings only; record the camera, then run the "
-                "file"
-            )
-        super().__init__(whole, InputConfig())
+        refused = f"{settings.predicted_depth}: predicted depth is for recordings only; record the camera, then run"
+        super().__init__(whole, refuse_live=f"{refused} the file")
         folder, inverse = Path(settings.predicted_depth), settings.predicted_inverse
         self._predicted = predicted_in_folder(folder, [""] * len(whole), inverse)
         self.depth_units_per_metre = None
@@ -144,10 +140,6 @@ class PredictedPair(ImagePair):
     number: int
     size: Size
     predicted: PredictedDepth
-    video: Video | None
-
-    def read_color(self) -> NDArray[np.uint8]:
-        return super().read_color() if self.video is None else self.video.frame(self.number)
 
     def read_depth(self, units_per_metre: float) -> Floats:
         return self.predicted.depth_of(self.number, *self.size)
@@ -183,7 +175,7 @@ def open_color_only(path: Path, settings: InputConfig) -> Source:
     calibration = resolve_calibration(path, None, size, settings, MM_PER_METRE)
     predicted = predicted_in_folder(Path(settings.predicted_depth), names, settings.predicted_inverse)
     images = [
-        PredictedPair(t, color, depth, number, size, predicted, video)
+        PredictedPair(t, color, depth, number, size, predicted, video=(video, number) if video else None)
         for number, (t, color, depth) in enumerate(zip(times_s.tolist(), colors, predicted.paths, strict=True))
     ]
     truth = read_groundtruth(path)

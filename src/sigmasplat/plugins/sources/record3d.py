@@ -183,8 +183,7 @@ def _calibration(
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
-        values = [json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers]
-        return np.array(values)
+        return np.array([json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers])
     return np.array(numbers) / (check_positive(where, "fps", json_number(where, metadata, "fps", 60.0) or 60.0))
 
 

@@ -84,29 +84,20 @@ def _files(folder: Path) -> FrameFiles:
 
 def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
     """Build both cameras from the scene's matrices, None if they are missing. Raises SourceError if one is damaged."""
-    where, found = _matrices(folder)
-    if "color_intrinsic" not in found:
+    names = [f"{part}_{kind}" for part in ("intrinsic", "extrinsic") for kind in ("color", "depth")]
+    files = {n: first_file(folder, (f"intrinsic/{n}.txt", f"{n.replace('_', 's_')}.txt", f"{n}.txt")) for n in names}
+    found = {name: (path, read_matrix(path)) for name, path in files.items() if path}
+    if "intrinsic_color" not in found:
         return None
-    camera = _camera(where["color_intrinsic"], found["color_intrinsic"], size, COLOR_SIZE)
-    if "depth_intrinsic" not in found:
-        raise SourceError(f"{where['color_intrinsic']}: the depth camera's matrix is missing; extract it too")
-    depth_camera = _camera(where["depth_intrinsic"], found["depth_intrinsic"], depth_size, DEPTH_SIZE)
-    ends = [found.get(f"{kind}_extrinsic", np.eye(4)) for kind in ("color", "depth")]
+    camera = _camera(*found["intrinsic_color"], size, COLOR_SIZE)
+    if "intrinsic_depth" not in found:
+        raise SourceError(f"{found['intrinsic_color'][0]}: the depth camera's matrix is missing; extract it too")
+    depth_camera = _camera(*found["intrinsic_depth"], depth_size, DEPTH_SIZE)
+    ends = [found[name][1] if name in found else np.eye(4) for name in names[2:]]
     if not all(se3.is_rigid(T) for T in ends):
         raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
     T_color_depth = ends[0] @ se3.inverse(ends[1])
     return Calibration(camera, MM_PER_METRE, depth_camera=depth_camera, T_color_depth=T_color_depth)
-
-
-def _matrices(folder: Path) -> tuple[dict[str, Path], dict[str, Matrix]]:
-    """Return file and value of each matrix by `{color|depth}_{intrinsic|extrinsic}`."""
-    where, found = {}, {}
-    for kind in ("color", "depth"):
-        for part in ("intrinsic", "extrinsic"):
-            names = (f"intrinsic/{part}_{kind}.txt", f"{part}s_{kind}.txt", f"{part}_{kind}.txt")
-            if path := first_file(folder, names):
-                where[f"{kind}_{part}"], found[f"{kind}_{part}"] = path, read_matrix(path)
-    return where, found
 
 
 def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:

@@ -6,7 +6,6 @@ calibration.json                      fx fy cx cy baseline_m: both images are re
 Depth belongs to the left image. It is computed from both images when a frame is read (`stereo_matching`).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +14,11 @@ from numpy.typing import NDArray
 
 from sigmasplat.api import (
     Calibration,
-    Camera,
     ImagePair,
     InputConfig,
     RecordedSource,
     SourceError,
     SourceFormat,
-    Trajectory,
     check_positive,
     first_size,
     json_number,
@@ -33,8 +30,6 @@ from sigmasplat.api import (
 )
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher, scene_scale
 from sigmasplat.plugins.sources.tum import read_list
-
-Pair = tuple[float, Path, Path]
 
 
 @dataclass(frozen=True)
@@ -67,39 +62,28 @@ class StereoSource(RecordedSource):
 
     computed_depth = True
 
-    def __init__(
-        self, name: str, pairs: Sequence[Pair], camera: Camera, baseline_m: float, settings: InputConfig,
-        truth: Trajectory | None, skipped: Sequence[str] = (),
-    ) -> None:  # fmt: skip
-        """Prepare matching. `truth` is the path of the left camera.
-
-        Raises SourceError if the images do not match the calibration, or no frame has depth.
-        """
-        if settings.depth_scale:
-            raise SourceError(f"{name}: input.depth_scale does not apply to a stereo pair; correct its baseline")
-        matcher = StereoMatcher(camera, baseline_m)
-        images = [StereoPair(*pair, matcher) for pair in pairs]
-        super().__init__(name, images, Calibration(camera, 1.0), settings, truth, skipped)
-        self.depth_noise_per_m = matcher.noise_per_m
-        self.scene_scale = scene_scale(self.depth_of, len(self))
-
 
 def open_stereo(place: str, settings: InputConfig) -> StereoSource:
     """Open a folder of stereo pairs. Raises SourceError if lists, images, calibration or poses cannot be used."""
-    folder = Path(place)
+    folder, name = Path(place), Path(place).resolve().name
     (left_s, lefts), (right_s, rights) = (read_list(folder / name) for name in ("rgb.txt", "right.txt"))
     indices, alone = pair_times(folder, {"left": left_s, "right": right_s - settings.depth_delay_s}, settings)
     skipped = [f"{lefts[i]}: no right image" for i in alone]
-    pairs = [(float(left_s[i]), lefts[i], rights[j]) for i, j in indices]
     path = Path(settings.calibration or folder / "calibration.json")
-    found = resolve_calibration(folder, None, first_size([left for _, left, _ in pairs]), settings, 1.0)
+    found = resolve_calibration(folder, None, first_size([lefts[i] for i, _ in indices]), settings, 1.0)
     if not path.is_file():
         raise SourceError(f"{folder}: the baseline of the stereo pair is unknown; write {path} with baseline_m, metres")
     if found.distortion and settings.undistort:
         raise SourceError(f'{path}: field "distortion" is given, but a stereo pair must be rectified; rectify it first')
     baseline_m = check_positive(path, "baseline_m", json_number(path, read_json_object(path), "baseline_m"))
     truth = read_groundtruth(folder)
-    return StereoSource(folder.resolve().name, pairs, found.camera, baseline_m, settings, truth, skipped)
+    if settings.depth_scale:
+        raise SourceError(f"{name}: input.depth_scale does not apply to a stereo pair; correct its baseline")
+    matcher = StereoMatcher(found.camera, baseline_m)
+    images = [StereoPair(float(left_s[i]), lefts[i], rights[j], matcher) for i, j in indices]
+    source = StereoSource(name, images, Calibration(found.camera, 1.0), settings, truth, skipped)
+    source.depth_noise_per_m, source.scene_scale = matcher.noise_per_m, scene_scale(source.depth_of, len(source))
+    return source
 
 
 def _recognises(path: str) -> bool:

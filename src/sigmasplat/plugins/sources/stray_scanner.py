@@ -12,7 +12,6 @@ DatasetEncoder.swift). Recordings of 2021, whose odometry.csv has no header, are
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +34,6 @@ from sigmasplat.api import (
     csv_rows,
     folder_source,
     gyroscope_from_samples,
-    image_size,
     median_calibration,
     parse_numbers,
     read_lines,
@@ -49,20 +47,6 @@ R_CAMERA_PHONE = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 image's x points from the top of the phone to its bottom (ARKit's camera axes, with y and z reversed)."""
 INTRINSICS = ("fx", "fy", "cx", "cy")
 Rows = dict[int, dict[str, float]]
-
-
-@dataclass(frozen=True)
-class StrayImagePair(ImagePair):
-    """A frame of the video, and a depth image."""
-
-    video: Video
-    number: int
-
-    def read_color(self) -> NDArray[np.uint8]:
-        return self.video.frame(self.number)
-
-    def sizes(self) -> tuple[Size, Size]:
-        return self.video.size, image_size(self.depth)
 
 
 def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
@@ -82,16 +66,15 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
             f"({len(rows)} lines); copy the whole folder again"
         )
     images = [
-        StrayImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video, n,
-                      confidence=folder / "confidence" / depths[n].name)
+        ImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video=(video, n),
+                  confidence=folder / "confidence" / depths[n].name)
         for n in numbers
     ]  # fmt: skip
-    kept = set(numbers)
-    skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted(depths) if n not in kept]
-    known = _calibration(folder, [rows[n] for n in numbers], video.size)
-    truth, (moved_s, rates, forces) = _truth(rows, numbers), _imu(folder / "imu.csv")
-    gyroscope = gyroscope_from_samples(moved_s, rates)
-    if gyroscope and not gyroscope.measured_any(np.array([rows[n]["timestamp"] for n in numbers])):
+    skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted({*depths} - {*numbers})]
+    used, (moved_s, rates, forces) = [rows[n] for n in numbers], _imu(folder / "imu.csv")
+    times_s, known = np.array([row["timestamp"] for row in used]), _calibration(folder, used, video.size)
+    truth, gyroscope = _truth(times_s, used), gyroscope_from_samples(moved_s, rates)
+    if gyroscope and not gyroscope.measured_any(times_s):
         gyroscope = None
     return folder_source(
         folder, settings, images, known, MM_PER_METRE, truth, skipped, one_camera=True, estimated="ARKit",
@@ -138,14 +121,11 @@ def _matrix(path: Path) -> list[float]:
     return [rows[0][0], rows[1][1], rows[0][2], rows[1][2]]
 
 
-def _truth(rows: Rows, numbers: list[int]) -> Trajectory | None:
+def _truth(times_s: NDArray[np.float64], rows: list[dict[str, float]]) -> Trajectory:
     """Return ARKit's path: an estimate by the phone, not ground truth."""
-    poses = np.tile(np.eye(4), (len(numbers), 1, 1))
-    for T, n in zip(poses, numbers, strict=True):
-        row = rows[n]
-        T[:3, :3] = se3.rotation_from_quaternion(np.array([row["qw"], row["qx"], row["qy"], row["qz"]]))
-        T[:3, 3] = row["x"], row["y"], row["z"]
-    return Trajectory(np.array([rows[n]["timestamp"] for n in numbers]), poses)
+    poses, values = np.tile(np.eye(4), (len(rows), 1, 1)), np.array([[row[name] for name in POSE] for row in rows])
+    poses[:, :3, :3], poses[:, :3, 3] = se3.rotation_from_quaternion(values[:, [8, 5, 6, 7]]), values[:, 2:5]
+    return Trajectory(times_s, poses)
 
 
 def _imu(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -22,9 +22,9 @@ mirrored world. With F = diag(1, −1, 1, 1), T_ours = F · T · F is its reflec
 """
 
 import json
-from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +37,6 @@ from sigmasplat.api import (
     MM_PER_METRE,
     TUM_UNITS_PER_METRE,
     UINT16_MAX,
-    Calibration,
     Camera,
     Frame,
     Gyroscope,
@@ -73,16 +72,9 @@ MOTION_CAPTURE = 0.004, float(np.deg2rad(0.3))
 much, whatever the time between two poses."""
 
 
-def open_tum(
-    path: str, settings: InputConfig, camera: Calibration | None = None,
-    camera_path: Callable[[Trajectory], Trajectory] | None = None,
-) -> RecordedSource:  # fmt: skip
-    """Open a folder. Raises SourceError if its lists, images, calibration, ground-truth poses or gyroscope cannot be
-    used.
-
-    camera: the calibration, if it does not follow from the folder's name;
-    camera_path: converts the recorded path to the camera's path, if another body was recorded.
-    """
+def open_tum(path: str, settings: InputConfig, bonn: bool = False) -> RecordedSource:
+    """Open a folder; bonn: whether it has the camera and the markers' path of the Bonn data set. Raises SourceError if
+    its lists, images, calibration, ground-truth poses or gyroscope cannot be used."""
     folder = Path(path)
     colors_of = first_file(folder, COLOR_LISTS) or folder / COLOR_LISTS[0]
     color_s, colors = read_list(colors_of)
@@ -100,8 +92,9 @@ def open_tum(
         for i in alone
     ]
     truth = read_groundtruth(folder)
-    truth = camera_path(truth) if truth and camera_path else truth
-    known = camera or freiburg_calibration(folder)
+    if bonn and truth:
+        truth = Trajectory(truth.timestamps_s, T_ROS @ truth.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+    known = BONN if bonn else freiburg_calibration(folder)
     truth = replace(truth, error_rms=MOTION_CAPTURE) if truth and known else truth
     gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
     units = TUM_UNITS_PER_METRE if colors_of.name == COLOR_LISTS[0] else MM_PER_METRE
@@ -202,15 +195,6 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 )  # fmt: skip
 
 
-def open_bonn(path: str, settings: InputConfig) -> RecordedSource:
-    """Open a folder of the Bonn data set. Raises SourceError as `open_tum`."""
-
-    def camera_path(markers: Trajectory) -> Trajectory:
-        return Trajectory(markers.timestamps_s, T_ROS @ markers.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
-
-    return open_tum(path, settings, BONN, camera_path)
-
-
 ICL_NUIM = published("that of ICL-NUIM", Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -269,6 +253,8 @@ def _is_icl_nuim(path: str) -> bool:
 
 PLUGIN = (
     SourceFormat("TUM", "rgb.txt and depth.txt", _has_lists, open_tum, priority=1),
-    SourceFormat("Bonn dynamic", "TUM's lists under rgbd_bonn_…", _is_bonn, open_bonn, priority=2, sensor="kinect-v1"),
+    SourceFormat(
+        "Bonn dynamic", "TUM's lists under rgbd_bonn_…", _is_bonn, partial(open_tum, bonn=True), 2, "kinect-v1"
+    ),
     SourceFormat("ICL-NUIM", "associations.txt", _is_icl_nuim, open_icl_nuim, priority=1),
 )
