@@ -50,19 +50,19 @@ class ControlPanel:
 
     def _add_path_controls(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Camera", expand_by_default=False):
-            self.row: Any = gui.add_slider(
-                "image", 0, 1, 1, 1, hint="an image of the recording: the yellow camera took it"
-            )
+            self.row: Any = gui.add_slider("image", 0, 1, 1, 1, hint="an image of the recording, by its number")
             self.frame = gui.add_markdown("")
             self.look = gui.add_button("go there", hint="look from where this image was taken")
             self.follow: Any = gui.add_checkbox(
                 "follow the camera", False, visible=False, hint="stay behind the camera while it records"
             )
-            self.path = gui.add_checkbox("its path", False, hint="red: where it did not know its position")
+            self.path: Any = gui.add_checkbox("its path", False, hint="red: where it did not know its position")
             self.keyframes = gui.add_checkbox(
                 "images kept", False, hint="the map is made from these; click one to go there and see it"
             )
-            self.true_path = gui.add_checkbox("its true path", False, visible=False, hint="blue: measured by others")
+            self.true_path: Any = gui.add_checkbox(
+                "its true path", False, visible=False, hint="blue: measured by others"
+            )
 
     @property
     def layer(self) -> str | None:
