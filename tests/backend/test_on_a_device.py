@@ -27,7 +27,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.plugins.checks import installation
 from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.plugins.viewer.layers import render_layer
+from sigmasplat.plugins.viewer.layers import ShownMap, render_layer
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 from sigmasplat.render import FieldRenderer, render
@@ -250,7 +250,7 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
     assert {x.device.type for x in slam.checkpoint().values()} == {"cpu"}
     pieces = [piece.field.params for piece in shown[-1].pieces]
     assert pieces and all(params.device.type == "cpu" and 0 < len(params) <= 200 for params in pieces)
-    seen = render_layer(slam.field, ROOM.camera, np.eye(4), "U", slam.config.render, "cuda")
+    seen = render_layer(ShownMap(slam.field, None, slam.config.render, "cuda"), ROOM.camera, np.eye(4), "U")
     assert seen.pixels.std() > 0
     write_state(tmp_path / "state", state_of(slam), CLASSES, fixed(slam))
     slam.step(ROOM.frame(FRAMES - 1))

@@ -15,14 +15,13 @@ from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.viewer import snapshot as lines
 from sigmasplat.plugins.viewer.layers import (
     Legend,
+    ShownMap,
     browser_camera,
     covariances,
     draw_legend,
-    merge_pieces,
-    merged_uncertainty,
+    merged,
     palette_range,
     render_layer,
-    render_predicted,
     shown,
     splat_arrays,
     uncertainties,
@@ -35,6 +34,7 @@ from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncer
 from sigmasplat.uncertainty.predictive import predict
 
 OPTIONS = RenderConfig()
+HOW = OPTIONS, "auto"
 
 
 def field_of(count: int, seed: int = 0) -> GaussianField:
@@ -103,16 +103,16 @@ def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     most, least = int(sigma.numpy().argmax()), int(sigma.numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
     half = splat_arrays(Piece(None, field, sure=sigma < sigma.median()), (0.0, 0.3), False)
-    assert len(half) == len(half.covariances) == len(half.colors) == int((sigma < sigma.median()).sum())
+    assert len(half.centers) == len(half.covariances) == len(half.colors) == int((sigma < sigma.median()).sum())
 
 
 def test_merged_pieces_hold_the_visible_splats_in_the_world_frame() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.1, -0.2, 0.3]))
     sure = torch.arange(20) % 4 > 0
     pieces = (Piece(0, field_of(30)), Piece(1, field_of(20, seed=1), T, sure=sure))
-    whole = merge_pieces(pieces, False)
+    whole = merged(pieces, False, *HOW).field
     torch.testing.assert_close(whole.means[30:], pieces[1].field.moved(torch.from_numpy(T)).means[sure])
-    assert len(whole) == 45 and len(pieces[0].field) == 30 and len(merge_pieces(pieces, True)) == 50
+    assert len(whole) == 45 and len(pieces[0].field) == 30 and len(merged(pieces, True, *HOW).field) == 50
 
 
 def test_merging_pieces_equals_moving_and_appending_fields() -> None:
@@ -120,7 +120,7 @@ def test_merging_pieces_equals_moving_and_appending_fields() -> None:
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
     first, second = field_of(30), field_of(20, seed=1)
     second.get_or_create("harmonics").params += torch.randn(20, 45, generator=torch.Generator().manual_seed(0))
-    found = merge_pieces((Piece(0, first), Piece(1, second, T)), False)
+    found = merged((Piece(0, first), Piece(1, second, T)), False, *HOW).field
     expected = first.moved(torch.eye(4))
     expected.append(second.moved(torch.from_numpy(T)))
     torch.testing.assert_close(found.params, expected.params)
@@ -184,7 +184,7 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     field, camera, T = field_of(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
     T[2, 3] = -0.5
     seen = render(field, camera, se3.inverse(T))
-    shown = {n: render_layer(field, camera, T, n, OPTIONS, "auto") for n in ("colour", "depth", "V", "U")}
+    shown = {n: render_layer(ShownMap(field, None, *HOW), camera, T, n) for n in ("colour", "depth", "V", "U")}
     np.testing.assert_array_equal(shown["colour"].pixels, (seen.color.clamp(0, 1) * 255).round().numpy())
     assert shown["colour"].legend is None
     covered = (seen.alpha > 0.5).numpy()
@@ -198,7 +198,7 @@ def test_layers_show_the_maps_of_the_renderer() -> None:
     assert depth is not None and 2.0 < depth.low < depth.high < 4.5 and depth.unit == " m"
     for unknown in ("splats", "color error", "normals"):
         with pytest.raises(ValueError, match=f"no layer '{unknown}' is rendered"):
-            render_layer(field, camera, T, unknown, OPTIONS, "auto")
+            render_layer(ShownMap(field, None, *HOW), camera, T, unknown)
 
 
 def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:
@@ -207,7 +207,8 @@ def test_u_is_the_spread_of_depth_about_the_rendered_depth() -> None:
     means = torch.stack([torch.zeros(2), torch.zeros(2), z], 1)
     scales = torch.tensor([[5.0, 5.0, 1e-4]] * 2)
     field = GaussianField.from_values(means, scales, torch.zeros(2, 3), opacities=a)
-    made = render_layer(field, Camera(8, 8, 100.0, 100.0, 3.5, 3.5), np.eye(4), "U", OPTIONS, "auto")
+    shown = ShownMap(field, None, *HOW)
+    made = render_layer(shown, Camera(8, 8, 100.0, 100.0, 3.5, 3.5), np.eye(4), "U")
     w1, w2 = a, (1 - a) * a
     about = (w1 * 1 + w2 * 2) / (w1 + w2)
     expected = np.sqrt((w1 * (1 - about) ** 2 + w2 * (2 - about) ** 2) / (w1 + w2))
@@ -229,10 +230,10 @@ def test_splats_that_are_not_sure_are_hidden_unless_they_are_asked_for() -> None
     assert sure is not None and 0 < int(sure.sum()) < 200 and torch.equal(shown(piece, False), sure)
     drawn = splat_arrays(piece, None, False)
     np.testing.assert_array_equal(drawn.centers, piece.field.means[sure].numpy())
-    merged, known = merge_pieces([piece], False), merged_uncertainty([piece], False)
-    assert known is not None and len(known.splats) == len(merged) == len(drawn)
-    assert len(splat_arrays(piece, None, True)) == 200 and shown(replace(piece, sure=None), False).all()
-    assert merged_uncertainty([piece, piece], False) is None
+    field, known, *_ = merged([piece], False, *HOW)
+    assert known is not None and len(known.splats) == len(field) == len(drawn.centers)
+    assert len(splat_arrays(piece, None, True).centers) == 200 and shown(replace(piece, sure=None), False).all()
+    assert merged([piece, piece], False, *HOW).known is None
 
 
 def test_thinned_splats_keep_their_own_errors() -> None:
@@ -247,7 +248,7 @@ def test_thinned_splats_keep_their_own_errors() -> None:
 
 def test_layers_of_predicted_errors_show_the_prediction() -> None:
     piece, camera, T = uncertain(400), Camera(40, 30, 30.0, 30.0, 19.5, 14.5), np.eye(4)
-    known, how = piece.uncertainty, (OPTIONS, "auto")
+    known = piece.uncertainty
     assert known is not None
     found = predict(piece.field, known, camera, T, OPTIONS)
     covered = (render(piece.field, camera, T).alpha > 0.5).numpy()
@@ -255,12 +256,10 @@ def test_layers_of_predicted_errors_show_the_prediction() -> None:
         ("depth error", found.depth_std_m, covered, " m"),
         ("color error", found.color.sqrt(), np.ones_like(covered), ""),
     ):
-        whole = render_predicted(piece.field, known, camera, T, layer, *how)
+        whole = render_layer(ShownMap(piece.field, known, *HOW), camera, T, layer)
         assert whole.legend is not None and whole.legend.unit == unit
         assert whole.legend.high == pytest.approx(np.percentile(std.numpy()[where], 99), rel=1e-4)
         np.testing.assert_array_equal((whole.pixels == colormap.NO_READING).all(-1), ~where)
-    with pytest.raises(ValueError, match="no layer 'U' is predicted"):
-        render_predicted(piece.field, known, camera, T, "U", *how)
 
 
 def test_a_legend_shows_the_palette_from_end_to_end() -> None:

@@ -23,7 +23,7 @@ from sigmasplat.input.lists import read_poses
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.reconstruct import FusionInput
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
-from sigmasplat.plugins.viewer.layers import merge_pieces
+from sigmasplat.plugins.viewer.layers import merged
 from sigmasplat.plugins.viewer.server import free_port, is_loopback, open_server, url_of
 from sigmasplat.plugins.viewer.snapshot import Snapshot
 from sigmasplat.plugins.viewer.snapshot_sources import (
@@ -203,7 +203,9 @@ def test_the_live_map_and_its_images_equal_those_of_the_system(tmp_path: Path) -
     source = open_source(ROOM)
     before_final = shown[-2]
     kept = [slam.store.load(i).field.moved(torch.from_numpy(slam.atlas.anchors[i])).params for i in range(3)]
-    torch.testing.assert_close(merge_pieces(before_final.pieces, False).params, torch.cat(kept))
+    torch.testing.assert_close(
+        merged(before_final.pieces, False, slam.config.render, "auto").field.params, torch.cat(kept)
+    )
     for row in slam.keyframe_indices:
         picture = shown[-1].image(row)
         assert picture is not None

@@ -12,10 +12,10 @@ import viser
 from sigmasplat.api import Matrix, SigmaSplatError
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
 from sigmasplat.plugins.viewer import layers, snapshot as lines
-from sigmasplat.plugins.viewer.layers import PREDICTED_MODES, LayerImage, Legend
+from sigmasplat.plugins.viewer.layers import Legend, ShownMap
 from sigmasplat.plugins.viewer.motion import sway
 from sigmasplat.plugins.viewer.panel import ControlPanel, escaped
-from sigmasplat.plugins.viewer.ruler import Ruler, ShownMap
+from sigmasplat.plugins.viewer.ruler import Ruler
 from sigmasplat.plugins.viewer.scene import ViserScene, camera_pose, go_to_start, move_camera
 from sigmasplat.plugins.viewer.snapshot import BUDGET, Piece, Snapshot, within_budget
 
@@ -100,7 +100,7 @@ class ViewerApp:
         panel = self.panel
         panel.adapt(len(snapshot.path), snapshot.live, snapshot.true_positions is not None)
         pieces = snapshot.visible_pieces(panel.row.value)
-        known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged_uncertainty`
+        known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged`
         unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
         panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
         span = layers.palette_range(pieces) if panel.colouring.value == "how unsure" else None
@@ -170,18 +170,13 @@ class ViewerApp:
             if self._drawn.pop(key, None) is not None:
                 client.scene.set_background_image(None)
             return None
-        pose, (field, known, options, backend) = camera_pose(c), self._merge(snapshot, pieces)
-        state = (layer, pose.tobytes(), c.fov, c.aspect, field)
+        pose, shown = camera_pose(c), self._merge(snapshot, pieces)
+        state = (layer, pose.tobytes(), c.fov, c.aspect, shown.field)
         drawn, rows = self._drawn.get(key), LIVE_ROWS if snapshot.live else ROWS
         sharp_rows = rows if snapshot.live else max(rows, min(SHARP_ROWS, c.image_height))
         rows = sharp_rows if self._sharp else rows
         if drawn is None or drawn[0] != state or drawn[2] < rows:
-            camera = layers.browser_camera(c.fov, c.aspect, rows)
-            made: LayerImage
-            if layer in PREDICTED_MODES and known is not None:
-                made = layers.render_predicted(field, known, camera, pose, layer, options, backend)
-            else:
-                made = layers.render_layer(field, camera, pose, layer, options, backend)
+            made = layers.render_layer(shown, layers.browser_camera(c.fov, c.aspect, rows), pose, layer)
             if client.client_id not in self.server.get_clients():
                 return None  # the client has disconnected in the meantime
             client.scene.set_background_image(made.pixels, "jpeg", jpeg_quality=85)
@@ -194,8 +189,7 @@ class ViewerApp:
         """Return the shown splats as one field, the same object until they change."""
         splats = ([(p.field, p.T_world_piece.tobytes()) for p in pieces], unsure := self.panel.unsure.value)
         if self._merged[0] != splats:
-            merged = layers.merge_pieces(pieces, unsure), layers.merged_uncertainty(pieces, unsure)
-            self._merged = splats, ShownMap(*merged, snapshot.options, snapshot.backend)
+            self._merged = splats, layers.merged(pieces, unsure, snapshot.options, snapshot.backend)
         shown: ShownMap = self._merged[1]
         return shown
 

@@ -1,7 +1,6 @@
 """Colour the map: the splats that the browser draws, and the layers that SigmaSplat renders from its viewpoint."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -39,18 +38,14 @@ MIN_VISIBLE_OPACITY = 0.1
 """Splats with a lower opacity are ignored when the range of uncertainties is computed."""
 
 
-@dataclass(frozen=True, eq=False)
-class SplatArrays:
+class SplatArrays(NamedTuple):
     """N splats to draw: centers [N, 3] m and covariances [N, 3, 3] m² in the piece's frame, colors [N, 3] uint8,
-    opacities [N]."""
+    opacities [N, 1]."""
 
     centers: Floats
     covariances: Floats
     colors: colormap.Rgb
     opacities: Floats
-
-    def __len__(self) -> int:
-        return len(self.centers)
 
 
 def shown(piece: Piece, unsure: bool) -> Tensor:
@@ -73,9 +68,8 @@ def splat_arrays(piece: Piece, span: tuple[float, float] | None, unsure: bool) -
         colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
-    return SplatArrays(
-        chosen.means.numpy(), covariances(chosen.quats.numpy(), chosen.scales.numpy()), colors, chosen.opacities.numpy()
-    )
+    spread = covariances(chosen.quats.numpy(), chosen.scales.numpy())
+    return SplatArrays(chosen.means.numpy(), spread, colors, chosen.opacities.numpy()[:, None])
 
 
 def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
@@ -84,16 +78,21 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
     return np.asarray(spread @ spread.transpose(0, 2, 1), np.float32)
 
 
-def merge_pieces(pieces: Sequence[Piece], unsure: bool) -> GaussianField:
-    """Return the shown splats of all pieces as one field in the world frame."""
+class ShownMap(NamedTuple):
+    """The splats that are shown, in the world frame, how sure they are (None: not measured), and how they are rendered."""
+
+    field: GaussianField
+    known: MapUncertainty | None
+    options: RenderConfig
+    backend: str
+
+
+def merged(pieces: Sequence[Piece], unsure: bool, options: RenderConfig, backend: str) -> ShownMap:
+    """Return the shown splats of all pieces; how sure they are is known only for a single piece."""
     parts = (piece.field.part(shown(piece, unsure)).moved(torch.from_numpy(piece.T_world_piece)) for piece in pieces)
-    return GaussianField.side_by_side(parts)
-
-
-def merged_uncertainty(pieces: Sequence[Piece], unsure: bool) -> MapUncertainty | None:
-    """Return how sure the splats of `merge_pieces` are; None unless it was measured for the only piece."""
     known = pieces[0].uncertainty if len(pieces) == 1 else None
-    return None if known is None else known.at(shown(pieces[0], unsure))
+    known = None if known is None else known.at(shown(pieces[0], unsure))
+    return ShownMap(GaussianField.side_by_side(parts), known, options, backend)
 
 
 MODES = {
@@ -108,7 +107,7 @@ MODES = {
 """What the viewer can show, with its label: the splats, or a layer that SigmaSplat renders from the browser's
 viewpoint. A new one needs its branch in `render_layer`; lines and markers are in scene.py."""
 PREDICTED_MODES = ("color error", "depth error")
-"""Only for maps with predicted errors: `render_predicted` draws them."""
+"""Only for maps with predicted errors."""
 LEGEND_SIZE, LEGEND_BAR, INK, PAPER = (280, 34), 14, (233, 237, 242), (36, 40, 46)
 
 
@@ -134,16 +133,22 @@ def browser_camera(fov: float, aspect: float, height: int) -> Camera:
     return Camera(width, height, float(f), float(f), 0.5 * (width - 1), 0.5 * (height - 1))
 
 
-def render_layer(
-    field: GaussianField, camera: Camera, T_world_camera: Matrix, layer: str, options: RenderConfig, backend: str
-) -> LayerImage:
-    """Render a field and draw one layer of the result.
+def render_layer(shown: ShownMap, camera: Camera, T_world_camera: Matrix, layer: str) -> LayerImage:
+    """Render a map and draw one layer of the result.
 
     Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
-    that depth, in m (CG-SLAM eq. 10). Depth, V and U are drawn only where A > ½.
+    that depth, in m (CG-SLAM eq. 10); the predicted standard deviation of colour ("color error") or of depth in m
+    ("depth error"). All but colours are drawn only where A > ½; colour is predicted where the map is empty too.
     """
+    field, known, options, backend = shown
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
+        if layer in PREDICTED_MODES and known is not None:
+            parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
+            found, covered = predicted(parts, known.calibration), as_array(parts.alpha) > COVERED_ALPHA
+            if layer == "color error":
+                return _from_zero(as_array(found.color.sqrt()), np.ones_like(covered), "")
+            return _from_zero(as_array(found.depth_std_m), covered, " m")
         seen = render(field, camera, T_camera_world, None, options, backend)
         alpha = as_array(seen.alpha)
         covered = alpha > COVERED_ALPHA
@@ -160,26 +165,6 @@ def render_layer(
         assert spread is not None
         about = np.sqrt(np.maximum(as_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
-
-
-def render_predicted(
-    field: GaussianField, known: MapUncertainty, camera: Camera, T_world_camera: Matrix, layer: str,
-    options: RenderConfig, backend: str,
-) -> LayerImage:  # fmt: skip
-    """Draw the predicted standard deviation of colour ("color error") or of depth in m ("depth error").
-
-    Depth is drawn only where A > ½; colour is predicted where the map is empty too.
-    """
-    if layer not in PREDICTED_MODES:
-        raise ValueError(f"no layer {layer!r} is predicted")
-    T_camera_world = se3.inverse(T_world_camera)
-    with torch.no_grad():
-        parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
-        found = predicted(parts, known.calibration)
-    covered = as_array(parts.alpha) > COVERED_ALPHA
-    if layer == "color error":
-        return _from_zero(as_array(found.color.sqrt()), np.ones_like(covered), "")
-    return _from_zero(as_array(found.depth_std_m), covered, " m")
 
 
 def draw_legend(legend: Legend) -> colormap.Rgb:

@@ -1,27 +1,18 @@
 """Measure the distance between two points that a person clicks in the scene."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 import torch
 import viser
 
-from sigmasplat.api import Camera, GaussianField, MapUncertainty, Matrix, RenderConfig, predict, render, se3
+from sigmasplat.api import Camera, Matrix, predict, render, se3
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA
 from sigmasplat.plugins.outputs.video import look_along
+from sigmasplat.plugins.viewer.layers import ShownMap
 
 PICKED = Camera(17, 17, 500.0, 500.0, 8.0, 8.0)
 """Renders the surroundings of a clicked point, as sharp as an image 500 pixels wide."""
-
-
-class ShownMap(NamedTuple):
-    """The splats that are shown, in the world frame, how sure they are, and how they are rendered."""
-
-    field: GaussianField
-    known: MapUncertainty | None
-    options: RenderConfig
-    backend: str
 
 
 def point_on_ray(shown: ShownMap, origin: Matrix, direction: Matrix) -> tuple[Matrix, float] | None:

@@ -33,11 +33,10 @@ class ViserScene:
 
     def show_splats(self, splats: Mapping[str, tuple[SplatArrays, Matrix]]) -> None:
         """Show exactly these pieces, by name, each at its T_world_piece."""
-        drawn = {name: part for name, part in splats.items() if len(part[0])}
+        drawn = {name: part for name, part in splats.items() if len(part[0].centers)}
         for name in self._splats.keys() - drawn.keys():
             self._splats.pop(name).remove()
-        for name, (part, _) in drawn.items():
-            arrays = (part.centers, part.covariances, part.colors, part.opacities[:, None])
+        for name, (arrays, _) in drawn.items():
             if name in self._splats:
                 self._splats[name].set_gaussians(*arrays)
             else:
