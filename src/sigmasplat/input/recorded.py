@@ -278,13 +278,12 @@ class RecordedSource(Source):
 
     def _refuse_other_clock(self) -> None:
         """Raise SourceError before a run if the gyroscope measured at another time than the images were taken."""
-        if self._gyroscope is None:
-            return
-        if not self._gyroscope.measured_any(np.array([pair.timestamp_s for pair in self._images])):
+        images_s = np.array([pair.timestamp_s for pair in self._images])
+        if self._gyroscope and not self._gyroscope.measured_any(images_s):
             first_s, last_s = self._gyroscope.timestamps_s[[0, -1]]
             raise SourceError(
                 f"{self.name}: the gyroscope measured from {first_s:.3f} to {last_s:.3f} s, but the images were taken "
-                f"from {self._images[0].timestamp_s:.3f} to {self._images[-1].timestamp_s:.3f} s; use the same clock"
+                f"from {images_s[0]:.3f} to {images_s[-1]:.3f} s; use the same clock"
             )
 
 

@@ -184,18 +184,15 @@ class Source(ABC):
                 with guarded(f"{self.name}, frame {i}", "copy its files again", SourceError):
                     frame = self.frame(i)
             except SourceError as error:
-                self._skip(error)
+                if self.strict:
+                    raise
+                if str(error) not in self.skipped:  # a second pass finds the same damage
+                    self.skipped.append(str(error))
                 continue
             found = True
             yield frame
         if not found:
             raise SourceError(f"{self.name}: none of {len(self)} frames can be read (first: {self.skipped[:1]})")
-
-    def _skip(self, error: SourceError) -> None:
-        if self.strict:
-            raise error
-        if str(error) not in self.skipped:  # a second pass finds the same damage
-            self.skipped.append(str(error))
 
     def _checked_index(self, i: int) -> int:
         if not 0 <= i < len(self):

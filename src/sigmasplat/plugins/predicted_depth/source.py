@@ -121,8 +121,8 @@ class WithPredictedDepth(Subset):
     def __init__(self, whole: Source, settings: InputConfig) -> None:
         refused = f"{settings.predicted_depth}: predicted depth is for recordings only; record the camera, then run"
         super().__init__(whole, refuse_live=f"{refused} the file")
-        folder, inverse = Path(settings.predicted_depth), settings.predicted_inverse
-        self._predicted = predicted_in_folder(folder, [""] * len(whole), inverse)
+        names, folder = [""] * len(whole), Path(settings.predicted_depth)
+        self._predicted = predicted_in_folder(folder, names, settings.predicted_inverse)
         self.depth_units_per_metre = None
         _say_predicted(self)
 

@@ -5,6 +5,7 @@ come from the device. The SDK moves depth to the colour camera's pixels, but kee
 depth camera, which differ by some millimetres.
 """
 
+import itertools
 import weakref
 from collections.abc import Iterator
 from dataclasses import replace
@@ -75,8 +76,7 @@ class RealSense(LiveSource):
             self._stop()
 
     def _framesets(self) -> Iterator[Any]:
-        count = 0
-        while True:
+        for count in itertools.count():
             try:
                 frames = self._pipeline.wait_for_frames(TIMEOUT_MS)
             except RuntimeError as error:
@@ -85,8 +85,7 @@ class RealSense(LiveSource):
                     raise SourceError(problem) from error
                 self.ending = problem
                 return
-            count += 1
-            if count > WARM_UP_FRAMES:
+            if count >= WARM_UP_FRAMES:
                 yield frames
 
 

@@ -67,9 +67,6 @@ class Archive:
         self._inner = next((n.removesuffix("metadata") for n in listed if n.endswith("/metadata")), "")
         self.names = [name.removeprefix(self._inner) for name in listed]
 
-    def __contains__(self, name: str) -> bool:
-        return name in self.names
-
     def read(self, name: str, most: int = MOST_MEMBER_BYTES) -> bytes:
         """Return the bytes of a file. Raises SourceError naming it if it is missing, damaged, encrypted, or has more
         than `most` bytes."""
@@ -105,7 +102,7 @@ class R3dImagePair(ImagePair):
         """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
         depth_m = without_nan(self._unpacked("depth", np.float32))
         name = f"rgbd/{self.number}.conf"
-        if name in self.archive:
+        if name in self.archive.names:
             depth_m = np.where(self._unpacked("conf", np.uint8) > 0, depth_m, np.float32(0.0))
         return depth_to_metres(self.depth, depth_m, units_per_metre)
 
@@ -128,7 +125,7 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
     path = _packed(Path(place))
     archive = Archive(path)
-    name = "metadata.json" if "metadata.json" in archive else "metadata"
+    name = "metadata.json" if "metadata.json" in archive.names else "metadata"
     metadata = parse_json(archive.read(name, MOST_JSON_BYTES), path / name)
     if not isinstance(metadata, dict):
         raise SourceError(f"{path / name}: holds a {type(metadata).__name__}, not an object with K, w, h")

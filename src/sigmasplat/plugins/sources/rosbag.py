@@ -29,7 +29,7 @@ from sigmasplat.api import (
     accelerometer_from_samples,
     associate,
     gyroscope_from_samples,
-    refuse_unpaired,
+    pair_times,
     time_origins,
 )
 from sigmasplat.plugins.sources import bag_cameras, bag_messages
@@ -128,18 +128,17 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     calibration, topics = bag_cameras.read_bag_calibration(bag, color, depth, settings), (color.name, depth.name)
     found = bag.index(*topics)
     entries = found[color.name], found[depth.name]
-    pairs, recorded_time = _paired(entries, settings)
+    recorded_time = _uses_recorded_time(entries, settings)
     color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
     colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
     depth_s = depth_s - settings.depth_delay_s
-    refuse_unpaired(bag.path, {color.name: color_s, depth.name: depth_s}, len(pairs), settings)
+    pairs, alone = pair_times(bag.path, {color.name: color_s, depth.name: depth_s}, settings)
     known = 0.0 if recorded_time else 1.0  # how long messages travel says nothing about the images
     times = [(i, j, float(color_s[i]), known * float(depth_s[j] - color_s[i])) for i, j in pairs]
     images = [
         BagImagePair(t, colors[i], depths[j], bag, topics, (entries[0][i], entries[1][j]), depth_late_s=late)
         for i, j, t, late in times
     ]
-    alone = sorted(set(range(len(colors))) - set(pairs[:, 0].tolist()))
     skipped = [f"{colors[i]}: no depth within {settings.max_gap_s:g} s" for i in alone]
     clock = ("recording time", ASSUMED, "header times") if recorded_time else ("header time", "read from the bag")
     gyroscope, accelerometer = read_bag_imu(bag, color, color_s)
@@ -149,18 +148,18 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     )  # fmt: skip
 
 
-def _paired(entries: tuple[Sequence[Entry], Sequence[Entry]], settings: InputConfig) -> tuple[NDArray[np.intp], bool]:
-    """Pair colour with depth by header time, or by recording time if that finds more pairs.
+def _uses_recorded_time(entries: tuple[Sequence[Entry], Sequence[Entry]], settings: InputConfig) -> bool:
+    """Return whether the recording times pair colour with depth more often than the header times.
 
     Some drivers leave the headers empty, or use a different clock for each sensor.
     """
     has_times = all(part[0].stamp_ns != part[-1].stamp_ns or len(part) == 1 for part in entries)
-    clocks = (False, True) if has_times else (True,)
-    found = []
-    for recorded in clocks:
+
+    def pairs(recorded: bool) -> int:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
-        found.append((associate(color_s, depth_s - settings.depth_delay_s, settings.max_gap_s), recorded))
-    return max(found, key=lambda answer: len(answer[0]))
+        return len(associate(color_s, depth_s - settings.depth_delay_s, settings.max_gap_s))
+
+    return not has_times or pairs(True) > pairs(False)
 
 
 def _times_s(entries: Sequence[Entry], recorded: bool) -> Values:

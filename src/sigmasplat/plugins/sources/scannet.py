@@ -123,7 +123,12 @@ def open_scannetpp(path: str, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
     dslr = _dslr(Path(path))
     fields = read_json_object(dslr / TRANSFORMS)
-    _refuse_missing_folders(dslr)
+    for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
+        if not (dslr / part).is_dir():
+            there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
+            raise SourceError(
+                f"{dslr}: no {part}/ (found {there}); create it with {made_by}, for the undistorted camera"
+            )
     views = _chosen(dslr, fields, "test", "test_frames") if fields.get("test_frames") else []
     views = [view for view in views if (dslr / IMAGES / view["file_path"]).is_file()]
     test = _source(dslr, fields, views, settings) if views else None
@@ -153,15 +158,6 @@ def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
     if absent:
         raise SourceError(f"{dslr / LISTS}: {absent[0]} of {split!r} is not among the {key} of {TRANSFORMS.name}")
     return [frames[name] for name in names]
-
-
-def _refuse_missing_folders(dslr: Path) -> None:
-    for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
-        if not (dslr / part).is_dir():
-            there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
-            raise SourceError(
-                f"{dslr}: no {part}/ (found {there}); create it with {made_by}, for the undistorted camera"
-            )
 
 
 def _dslr(scene: Path) -> Path:

@@ -107,10 +107,9 @@ def _odometry(path: Path) -> Rows:
 
 def _calibration(folder: Path, rows: list[dict[str, float]], size: Size) -> Calibration | None:
     """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
-    path, file = folder / "camera_matrix.csv", folder / "odometry.csv"
-    if set(INTRINSICS) <= set(rows[0]):
-        focals = np.array([[row[name] for name in INTRINSICS] for row in rows])
-        return median_calibration(file, size, focals, MM_PER_METRE)
+    path, focals = folder / "camera_matrix.csv", [[row[name] for name in INTRINSICS if name in row] for row in rows]
+    if len(focals[0]) == len(INTRINSICS):
+        return median_calibration(folder / "odometry.csv", size, np.array(focals), MM_PER_METRE)
     return Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE) if path.is_file() else None
 
 

@@ -38,5 +38,4 @@ def wall_path(frames: int, seed: int) -> Matrix:
     wave = {name: np.sin(2 * np.pi * (i / period + random.uniform())) for name, period in PERIODS.items()}
     x = MARGIN_M - HALF_X_M + STEP_M * i
     at = np.column_stack([x, np.full(frames, -AWAY_M), EYE_M + BOB_M * wave["bob"]])
-    turned = np.column_stack([np.full(frames, np.pi / 2), NOD_RAD * wave["nod"], np.zeros(frames)])
-    return np.stack([pose(*each) for each in zip(at, *turned.T, strict=True)])
+    return np.stack([pose(each, np.pi / 2, pitch, 0.0) for each, pitch in zip(at, NOD_RAD * wave["nod"], strict=True)])
