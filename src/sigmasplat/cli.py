@@ -46,7 +46,7 @@ COMMANDS = {
     "eval": ("evaluate", "evaluate_run"),
     "mesh": ("mesh", "make_mesh"),
     "export": ("export", "export"),
-    "share": ("share", "share"),
+    "share": ("export", "share"),
     "download": ("download", "download"),
     "bench": ("batch", "bench"),
     "doctor": ("installation", "doctor"),

@@ -194,3 +194,15 @@ def test_a_double_tap_goes_there_and_the_camera_stays_near_what_was_seen(page: P
     assert page.value("sigmasplat.cam.eye") == high and low < high
     press(page, "back")
     assert np.allclose(page.value("sigmasplat.cam.eye"), before, atol=1e-6)
+
+
+def test_without_webgl_a_sentence_and_a_picture_are_shown(shared: Path, tmp_path: Path) -> None:
+    with chromium("about:blank", tmp_path / "profile") as port:
+        page = Page(port)
+        page.call("Page.enable")
+        page.call(
+            "Page.addScriptToEvaluateOnNewDocument", source="HTMLCanvasElement.prototype.getContext = () => null"
+        )  # fmt: skip
+        page.call("Page.navigate", url=shared.as_uri())
+        wait_for(lambda: "no WebGL 2" in (page.value("document.getElementById('hint').innerText") or ""))
+        assert page.screenshot().std() > 20 and page.value("document.getElementById('poster').naturalWidth") == 96

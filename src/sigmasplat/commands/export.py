@@ -1,4 +1,4 @@
-"""Write a run or a map in other programs' formats: sigmasplat export."""
+"""Write a run or a map in other programs' formats, or as a page for a browser: sigmasplat export, sigmasplat share."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,6 +10,7 @@ from sigmasplat.commands import options
 from sigmasplat.commands.input_options import From0, Number, arg, flag
 from sigmasplat.commands.options import prepare_torch, refuse_existing
 from sigmasplat.config.ranges import Range
+from sigmasplat.errors import ConfigError
 from sigmasplat.files.lock import output_locked
 from sigmasplat.plugins.outputs.formats import ExportSource, choose, listed, refuse_unused
 from sigmasplat.registry import Output, rows
@@ -85,6 +86,28 @@ def export(
         refuse_existing(target, overwrite)  # another process may have written it meanwhile
         content = chosen.write(source, target, **{name: getattr(asked, name) for name in chosen.options})
     print(f"{target}: {content}" + (f", {target.stat().st_size / 1e6:.1f} MB" if target.is_file() else ""))
+    return 0
+
+
+def share(
+    run: options.RunPath,
+    out: Annotated[Path | None, arg("FILE.html", "page to write", "(default: named after RUN, in this folder)")] = None,
+    film: Annotated[bool, flag("also write a film of ten seconds along the path, FILE.mp4")] = False,
+    up: options.UpEdge = "auto", overwrite: options.Overwrite = False,
+) -> int:  # fmt: skip
+    """Write a run as one HTML page that any browser opens, offline: walk around, measure, see what is uncertain.
+
+    example: sigmasplat share runs/kitchen-sigma --out kitchen.html
+    """
+    target = out or Path(run.resolve().name + ".html")
+    if target.suffix.lower() != ".html":
+        raise ConfigError(f"browsers do not open {target} as a page; give --out a name that ends in .html")
+    beside = target.with_suffix(".mp4")
+    refuse_existing(beside if film else None, overwrite)
+    export(run, target, "html", overwrite, ExportOptions(up=up))
+    print("open it in a browser, or send it: it needs no network")
+    if film:
+        export(run, beside, "video", overwrite, ExportOptions(seconds=10.0, panels="color"))
     return 0
 
 

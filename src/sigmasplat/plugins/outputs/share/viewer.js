@@ -200,7 +200,7 @@ function pick(x, y) {
   return null;
 }
 
-// ---- Motion, ruler and path ----
+// ---- Motion and hands ----
 
 let splats, draw, sorter, order = new Uint32Array(0), sorted = "", sorting = false;
 let flight = null, sway = null, changed = true, sharp = false, quality = 1, movedAt = 0, drawnAt = 0;
@@ -288,8 +288,6 @@ function drawOverlay(scale) {
   if (pressed("path")) mark(scene.path, scene.keyframes.map((T) => poseOf(T).eye), "#ffa640");
   mark(ends.map((end) => end.point), ends.map((end) => end.point), "#7ab7ff");
 }
-
-// ---- Hands ----
 
 function tap(x, y, at) {
   const twice = at - lastTap.at < TAP_MS && Math.hypot(x - lastTap.x, y - lastTap.y) < 30;
@@ -382,13 +380,10 @@ function listen() {
   });
   toggle("path", (on) => {
     say(on ? "Tap a dot to look from there." : "");
-    // The camera stands on the path, which is behind it: it steps back as far as the map can bear.
-    if (on) fly({ ...cam, eye: add(cam.eye, axesOf(cam)[2], -2) });
+    if (on) fly({ eye: add(cam.eye, axesOf(cam)[2], -2), yaw: cam.yaw }); // steps back, as the path is behind it
   });
   on("click", () => fly(poseOf(scene.keyframes[scene.start])), byId("back"));
 }
-
-// ---- Beginning ----
 
 async function unpack() {
   const packed = Uint8Array.from(atob(byId("splats").textContent), (letter) => letter.charCodeAt(0));
@@ -402,7 +397,7 @@ async function unpack() {
 async function begin() {
   const gl = view.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
   if (!gl || !window.DecompressionStream) return say("This browser has no WebGL 2: it shows only this picture.");
-  view.addEventListener("webglcontextlost", () => location.reload()); // a phone took the memory back
+  view.addEventListener("webglcontextlost", () => say("The browser took the memory back. Load the page again."));
   const planes = await unpack();
   draw = makeRenderer(gl, splats);
   sorter = new Worker(URL.createObjectURL(new Blob([`(${sortAsAsked})()`])));
