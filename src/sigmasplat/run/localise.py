@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,15 +56,6 @@ class Localisation:
     def position_m(self) -> float:
         """Return the standard deviation of the position, metres; nan if the image was not found."""
         return float("nan") if self.covariance is None else float(np.sqrt(np.trace(self.covariance[:3, :3])))
-
-    def record(self) -> dict[str, Any]:
-        """Return plain values, matrices as rows."""
-        values = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        matrices = {name: None if values[name] is None else values[name].tolist() for name in MATRICES}
-        return values | matrices | {"comparison": None if self.comparison is None else asdict(self.comparison)}
-
-
-MATRICES = ("T_world_camera", "covariance")
 
 
 class Localiser:
@@ -127,7 +117,7 @@ def write_localisations(path: Path, found: Sequence[Localisation]) -> None:
     Raises RunError if it cannot be written.
     """
     if path.suffix == ".jsonl":
-        write_text(path, "".join(json_line(result.record()) for result in found))
+        write_text(path, "".join(json_line(asdict(result)) for result in found))
     else:
         write_trajectory(path, path_of(found))
 

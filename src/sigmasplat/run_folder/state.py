@@ -71,7 +71,10 @@ def _checksum(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _names(made: Any) -> list[str]:
-    return [f.name for f in dataclasses.fields(made)] if dataclasses.is_dataclass(made) else list(made._fields)
+    """Return the fields of a named tuple, or those of a dataclass that its constructor takes."""
+    return (
+        [f.name for f in dataclasses.fields(made) if f.init] if dataclasses.is_dataclass(made) else list(made._fields)
+    )
 
 
 class _Encoder:
@@ -106,7 +109,7 @@ class _Encoder:
             return self._column(value)
         name = type(value).__name__
         if self.classes.get(name) is type(value):
-            fields = ", ".join(f"{_json(n)}: {self.text(v)}" for n, v in _fields(value).items())
+            fields = ", ".join(f"{_json(n)}: {self.text(getattr(value, n))}" for n in _names(value))
             return f'{{"object": {_json(name)}, "fields": {{{fields}}}}}'
         if type(value) is tuple:
             return f'{{"tuple": {self._list(value)}}}'
@@ -165,11 +168,3 @@ class _Decoder:
             return self.tensors[name].to(value.get("device", "cpu")) if kind == "tensor" else self.arrays[name]
         array = np.array(value[kind], value["type"]).reshape(value["shape"])
         return torch.from_numpy(array).to(value.get("device", "cpu")) if kind == "tensor" else array
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    """Return the fields of a named tuple, or those of a dataclass that its constructor takes."""
-    if dataclasses.is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value) if field.init}
-    named: dict[str, Any] = value._asdict()
-    return named

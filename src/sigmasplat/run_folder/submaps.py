@@ -118,7 +118,15 @@ class DiskStore:
         """Read the images of one keyframe. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
             color, depth_m = (file.get_slice(name)[keyframe] for name in ("colors", "depths_m"))
-            return Picture(color, depth_m, _detail(file, keyframe), _photo(file, keyframe))
+            names, detail, photo = file.keys(), None, None
+            if "details" in names:
+                camera = Camera(**json.loads(file.metadata()["detail_camera"]))
+                detail = Detail(file.get_slice("details")[keyframe], camera)
+            if "photos" in names:
+                ends = [0, *file.get_tensor("photo_ends").tolist()]
+                camera = Camera(**json.loads(file.metadata()["photo_camera"]))
+                photo = Photo(file.get_slice("photos")[ends[keyframe] : ends[keyframe + 1]], camera)
+            return Picture(color, depth_m, detail, photo)
 
     def probe(self, index: int, probe: int) -> Picture:
         """Read the images of one probe view. Raises RunError if the submap is missing or damaged."""
@@ -152,20 +160,3 @@ class DiskStore:
             raise RunError(f"no submap {index} in {self.folder}: {path.name} is missing; run it again")
         with open_tensors(path, "submap", arrays=True) as file:
             yield file
-
-
-def _detail(file: Any, keyframe: int) -> Detail | None:
-    """Read the gray image of a keyframe from the file of a submap, if it was kept."""
-    if "details" not in file.keys():  # noqa: SIM118
-        return None
-    camera = Camera(**json.loads(file.metadata()["detail_camera"]))
-    return Detail(file.get_slice("details")[keyframe], camera)
-
-
-def _photo(file: Any, keyframe: int) -> Photo | None:
-    """Read the colour of a keyframe at the camera's size from the file of a submap, if it was kept."""
-    if "photos" not in file.keys():  # noqa: SIM118
-        return None
-    ends = [0, *file.get_tensor("photo_ends").tolist()]
-    camera = Camera(**json.loads(file.metadata()["photo_camera"]))
-    return Photo(file.get_slice("photos")[ends[keyframe] : ends[keyframe + 1]], camera)

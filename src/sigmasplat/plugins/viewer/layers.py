@@ -79,7 +79,7 @@ def covariances(quats_wxyz: Floats, scales: Floats) -> Floats:
 
 
 class ShownMap(NamedTuple):
-    """The splats that are shown, in the world, how sure they are (None: not measured), and how they are rendered."""
+    """The splats that are shown, in the world frame, how sure they are if measured, and how they are rendered."""
 
     field: GaussianField
     known: MapUncertainty | None
