@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -24,11 +24,6 @@ class Callback:
 
     def last_loops(self, loops: Sequence["Loop"]) -> None:
         """Handle the loops tried after the last step."""
-
-
-def run_now(task: Callable[[], None]) -> None:
-    """Run a task at once."""
-    task()
 
 
 STANDARD_OUTPUTS = (1, 2)

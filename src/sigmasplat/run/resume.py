@@ -4,6 +4,7 @@ of SLAM between two frames as one tree."""
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import call
 from typing import Any
 
 from sigmasplat.data.atlas import Atlas
@@ -30,7 +31,6 @@ from sigmasplat.graph.loops import Loop, Loops
 from sigmasplat.input.source import Source
 from sigmasplat.mapping.mapper import Mapper, SecondHalf
 from sigmasplat.mapping.window import ValidationView, ValidationViews
-from sigmasplat.run.callbacks import run_now
 from sigmasplat.run.same_conditions import refuse_other_sequence
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.run_folder.state import read_state, write_state
@@ -108,7 +108,7 @@ class StateFile:
     slam: Slam
     run: RunFolder
     every_s: float = 0.0
-    run_save: Callable[[Callable[[], None]], None] = run_now
+    run_save: Callable[[Callable[[], None]], None] = call
     last_s: float = field(default_factory=time.perf_counter)
     took_s: float = 0.0
 

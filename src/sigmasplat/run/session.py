@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import InitVar, dataclass, field
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from sigmasplat.data.trajectory import RELOCALISED
 from sigmasplat.errors import RunError
 from sigmasplat.files.lock import LOCK, locked, no_warning
 from sigmasplat.input.source import Source
-from sigmasplat.run.callbacks import Callback, interrupt_event, run_now
+from sigmasplat.run.callbacks import Callback, interrupt_event
 from sigmasplat.run.same_conditions import start_facts
 from sigmasplat.run_folder.frames import RunFrames
 from sigmasplat.run_folder.runs import RunFolder
@@ -153,7 +154,7 @@ class Session:
     wall_s: InitVar[float] = 0.0
     readers: Sequence[Callback] = ()
     watch: Callable[[Frame], object] | None = None
-    later: Callable[[Callable[[], None]], None] = run_now
+    later: Callable[[Callable[[], None]], None] = call
     outcome: Outcome = field(init=False)
 
     def __post_init__(self, wall_s: float) -> None:

@@ -203,14 +203,13 @@ def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
     def with_new(values: NDArray[np.float32], name: str) -> NDArray[np.float32]:
         return np.concatenate([values, *(getattr(patch, name).astype(np.float32) for patch in patches)])
 
-    colors, std = mesh.colors, mesh.depth_std_m
     marks = np.zeros(len(mesh.vertices), bool) if mesh.filled is None else mesh.filled
     return replace(
         mesh,
         vertices=with_new(mesh.vertices, "points"),
         faces=np.concatenate(faces).astype(np.int32),
-        colors=None if colors is None else with_new(colors, "colors"),
-        depth_std_m=None if std is None else with_new(std, "depth_std_m"),
+        colors=None if mesh.colors is None else with_new(mesh.colors, "colors"),
+        depth_std_m=None if mesh.depth_std_m is None else with_new(mesh.depth_std_m, "depth_std_m"),
         filled=np.concatenate([marks, np.ones(start - len(marks), bool)]),
     )
 

@@ -51,9 +51,7 @@ class BagSink:
         """Write a message; its recording time is its stamp. Raises OSError if the disk is full."""
         self.writer.write(self.connections[message.topic.name], message.stamp_ns, message.data)
         self._bytes += len(message.data)
-        if (
-            self._bytes > CHUNK_BYTES
-        ):  # by itself, the library writes to the disk after 1 MB, which are minutes of poses
+        if self._bytes > CHUNK_BYTES:  # by itself, the library writes after 1 MB, which are minutes of poses
             self._bytes = 0
             with suppress(AttributeError):  # a later version may have other names
                 self.writer.storage.close_chunk()

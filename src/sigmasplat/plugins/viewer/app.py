@@ -56,7 +56,8 @@ class ViewerApp:
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(lambda client: self._drawn.pop(("layer", client.client_id), None))
         floating = lambda: bool(self.panel.floating.value) and self.panel.layer is None  # noqa: E731
-        for work in (self._work, lambda: sway(server, floating, self._stop_floating, self._stop)):
+        stop_floating = lambda: setattr(self.panel.floating, "value", False)  # noqa: E731
+        for work in (self._work, lambda: sway(server, floating, stop_floating, self._stop)):
             self._threads.append(threading.Thread(target=work, name="viewer", daemon=True))
             self._threads[-1].start()
 
@@ -232,21 +233,17 @@ class ViewerApp:
             go_to_start(client, self.server.initial_camera)
         self.changed()
 
-    def _stop_floating(self) -> None:
-        self.panel.floating.value = False
-
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot
         if snapshot is None or row >= len(snapshot.path):
             return
         self._go(client, snapshot, row)
+        image, missing = None, "its image was not kept"
         try:
             image = snapshot.image(row)
         except SigmaSplatError as problem:
-            self.panel.show_image(f"frame {row}: {escaped(str(problem))}", None)
-            return
-        missing = "" if image is not None else ": its image was not kept"
-        self.panel.show_image(f"frame {row}{missing}", image)
+            missing = escaped(str(problem))
+        self.panel.show_image(f"frame {row}" if image is not None else f"frame {row}: {missing}", image)
 
     def _look_from(self, client: viser.ClientHandle) -> None:
         snapshot = self._snapshot

@@ -54,12 +54,9 @@ class ViserScene:
         if segments is None or not len(segments.points):
             self._drop(name)
             return
+        colors, width = srgb_to_linear(segments.colors), LINE_PX[name]
         self._marks[name] = self.server.scene.add_line_segments(
-            f"/{name}",
-            segments.points,
-            srgb_to_linear(segments.colors),
-            thickness=LINE_PX[name],
-            thickness_units="screen",
+            f"/{name}", segments.points, colors, thickness=width, thickness_units="screen"
         )
 
     def show_label(self, text: str, position: Matrix | None) -> None:
