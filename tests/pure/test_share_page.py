@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -140,13 +141,14 @@ def test_a_run_is_shared_in_axes_with_y_up_and_nothing_is_loaded_from_elsewhere(
     assert exit_code("share", str(run.path), "--out", str(tmp_path / "a.pdf")) == 2
 
 
-def test_a_film_of_the_same_name_is_written_beside_the_page(tmp_path: Path) -> None:
+def test_a_film_and_a_mesh_of_the_same_name_are_written_beside_the_page(tmp_path: Path) -> None:
     run = made_run(tmp_path / "walk", submaps=True)
     (tmp_path / "a.mp4").touch()
     page_alone = ("share", str(run.path), "--out", str(tmp_path / "a.html"))
     assert exit_code(*page_alone, "--film") == 2 and not (tmp_path / "a.html").exists()
     (tmp_path / "a.mp4").unlink()
-    assert exit_code(*page_alone, "--film") == 0
+    assert exit_code(*page_alone, "--film", "--usdz") == 0
+    assert zipfile.is_zipfile(tmp_path / "a.usdz")
     film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert film.get(cv2.CAP_PROP_FRAME_COUNT) / film.get(cv2.CAP_PROP_FPS) == pytest.approx(10.0)
     assert film.get(cv2.CAP_PROP_FRAME_WIDTH) == 40  # colour alone

@@ -93,6 +93,7 @@ def share(
     run: options.RunPath,
     out: Annotated[Path | None, arg("FILE.html", "page to write", "(default: named after RUN, in this folder)")] = None,
     film: Annotated[bool, flag("also write a film of ten seconds along the path, FILE.mp4")] = False,
+    usdz: Annotated[bool, flag("also write a mesh for Quick Look on a phone or a Mac of Apple, FILE.usdz")] = False,
     up: options.UpEdge = "auto", overwrite: options.Overwrite = False,
 ) -> int:  # fmt: skip
     """Write a run as one HTML page that any browser opens, offline: walk around, measure, see what is uncertain.
@@ -102,12 +103,17 @@ def share(
     target = out or Path(run.resolve().name + ".html")
     if target.suffix.lower() != ".html":
         raise ConfigError(f"browsers do not open {target} as a page; give --out a name that ends in .html")
-    beside = target.with_suffix(".mp4")
-    refuse_existing(beside if film else None, overwrite)
+    movie, mesh = target.with_suffix(".mp4"), target.with_suffix(".usdz")
+    refuse_existing(movie if film else None, overwrite)
+    refuse_existing(mesh if usdz else None, overwrite)
     export(run, target, "html", overwrite, ExportOptions(up=up))
     print("open it in a browser, or send it: it needs no network")
     if film:
-        export(run, beside, "video", overwrite, ExportOptions(seconds=10.0, panels="color"))
+        export(run, movie, "video", overwrite, ExportOptions(seconds=10.0, panels="color"))
+    if usdz:
+        from sigmasplat.commands.mesh import make_mesh
+
+        make_mesh(run, out=mesh, up=up, overwrite=overwrite)
     return 0
 
 
