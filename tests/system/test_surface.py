@@ -238,6 +238,7 @@ def test_a_cropped_run_has_the_cropped_camera(run: RunFolder) -> None:
 
 
 def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("xatlas", reason="no wheel of xatlas for this machine")
     pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
     room, out = "synthetic:frames=120,width=64,height=48", str(tmp_path / "run")
     small = ["--set", "mapping.first_iterations=30", "--set", "mapping.iterations=8", "--set", "input.width=64",
@@ -261,6 +262,10 @@ def test_the_command_makes_a_mesh_of_a_real_run(tmp_path: Path, capsys: pytest.C
     assert 250 < len(z_up.faces) <= 500 and len(y_up.faces) == len(z_up.faces)
     np.testing.assert_allclose(y_up.triangles, z_up.corners[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
     np.testing.assert_allclose(np.sqrt(z_up.areas().sum() / mesh.areas().sum()), 1.0, atol=0.1, err_msg="still metres")
+    for name in ("t.glb", "t.usdz"):
+        assert exit_code("mesh", out, *budget, "--out", str(tmp_path / name)) == 0
+    (shown,) = trimesh.load_scene(tmp_path / "t.glb", process=False).geometry.values()
+    assert shown.visual.material.baseColorTexture.size == (2048, 2048) and len(shown.faces) == len(z_up.faces)
     for refused, words in (
         (["--out", str(tmp_path / "a.fbx")], "give a name that ends in .ply, .glb, .stl"),
         (["--out", str(tmp_path / "a.glb"), "--axes", "z-up"], "a GLB has y up by definition"),

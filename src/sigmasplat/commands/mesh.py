@@ -62,8 +62,8 @@ def make_mesh(
             surface = fusion_input.surface(voxel_m, progress=progress)
         seen, surface = len(surface.vertices), filled(surface, fill_gaps)
         if fill_gaps:
-            new = len(surface.vertices) - seen
-            screen.say(f"gaps up to {fill_gaps:g} m are closed: {new:,} vertices nobody has seen")
+            unseen = len(surface.vertices) - seen
+            screen.say(f"gaps up to {fill_gaps:g} m are closed: {unseen:,} vertices nobody has seen")
         if len(surface.faces) > triangles > 0:
             screen.say(f"{len(surface.faces):,} triangles are reduced to {triangles:,} (--triangles)")
             surface = decimated(surface, triangles)
