@@ -433,7 +433,7 @@ def test_a_followed_pose_has_the_error_of_its_own_motion(monkeypatch: pytest.Mon
     source = open_source(ROOM, limit=8)
     T_world_room = se3.inverse(source.truth().T_world_camera[0])
 
-    def off(self: Tracker, field: Any, view: Any, seen_now: Any, R_inertial_camera: Any) -> PoseFit:
+    def off(self: Tracker, field: Any, view: Any, seen_now: Any) -> PoseFit:
         i = len(seen) + 1
         seen.append(i)
         T_camera_world = se3.inverse(T_world_room @ source.truth().T_world_camera[i])
