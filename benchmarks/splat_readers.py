@@ -9,7 +9,6 @@ import torch
 
 from sigmasplat.data.field import ATTRIBUTES, COLUMNS, INITIAL_LOG_VARIANCE, WIDTH, GaussianField, Rows
 from sigmasplat.data.harmonics import count
-from sigmasplat.plugins.outputs.spz import HALF_TURN
 from sigmasplat.run_folder import splat_ply as ply
 from sigmasplat.run_folder.splat_values import SH_C0, SplatValues, unit
 
@@ -63,4 +62,4 @@ def _spz(path: Path) -> GaussianField:
         (low | middle << 8 | (high ^ 128) - 128 << 16) / 2.0**bits, np.roll(xyzw, 1, axis=1), scales / 16.0 - 10.0,
         _opacities(opacities[:, 0]), (colors / 255.0 - 0.5) / 0.15 * SH_C0 + 0.5, (harmonics - 128.0) / 128.0,
     )  # fmt: skip
-    return field_of(values).moved(HALF_TURN)
+    return field_of(values.turned_about_x())

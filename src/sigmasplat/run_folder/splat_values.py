@@ -1,14 +1,14 @@
 """Convert fields to the arrays that splat files are packed from, and check those that were read."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.data.harmonics import DEGREES, count
+from sigmasplat.data.field import ATTRIBUTES, COLUMNS, GaussianField
+from sigmasplat.data.harmonics import DEGREES, count, turned
 from sigmasplat.errors import SourceError
 
 Doubles = NDArray[np.float64]
@@ -33,6 +33,8 @@ def smallest_three(quats: Doubles) -> tuple[NDArray[np.intp], Doubles]:
 
 SH_C0 = 0.28209479177387814
 """Y₀₀ = 1/(2√π): the constant spherical harmonic."""
+R_RUB_RDF = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+"""Rotates axes x right, y down, z forward to x right, y up, z back, and back."""
 MORTON_BITS, ROUNDING = 20, 1e-6
 
 
@@ -72,6 +74,17 @@ class SplatValues:
     def ordered(self, rows: NDArray[np.intp]) -> "SplatValues":
         """Return the splats selected by an index array, in its order."""
         return SplatValues(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def turned_about_x(self) -> "SplatValues":
+        """Return the splats rotated by 180° about x: from axes x right, y down, z forward to x right, y up, z back.
+
+        It is its own inverse. Only signs change: of means, quaternions and harmonics.
+        """
+        xyz = R_RUB_RDF.diagonal().numpy()
+        ones = torch.ones(1, ATTRIBUTES["harmonics"], dtype=torch.float64)
+        signs = turned(ones, R_RUB_RDF).round().numpy()[:, : self.harmonics.shape[1]]
+        quats = self.quats * np.array([1.0, *xyz])
+        return replace(self, means=self.means * xyz, quats=quats, harmonics=self.harmonics * signs)
 
 
 def _harmonics(field: GaussianField) -> Doubles:

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from sigmasplat.api import ConfigError, GaussianField, Matrix, RunError, SigmaSplatError, SplatStd
 from sigmasplat.plugins.outputs.axes import AXES, Axes, Edge, levelled, transform_to
-from sigmasplat.plugins.outputs.spz import HALF_TURN
 
 if TYPE_CHECKING:
     from sigmasplat.plugins.outputs.source import ExportSource
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
 
 Y_UP_FORMATS: tuple[Axes, ...] = ("y-up", "camera")
 """The axes of formats that define y as up. `camera` is not levelled, only rotated by 180° about x."""
+HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
 WriteSplats = Callable[[GaussianField, SplatStd | None], None]
 
 
@@ -74,7 +74,7 @@ def _transform(source: "ExportSource", axes: Axes, own: Axes, up: Edge) -> tuple
     """Return the transform [4, 4] before writing, and how up was found."""
     if axes == "camera":
         return np.eye(4), ""
-    turn = HALF_TURN.numpy() if own == "y-up" else np.eye(4)
+    turn = HALF_TURN if own == "y-up" else np.eye(4)
     if source.path.is_file():
         return turn @ transform_to(axes), " (a map without a path is not levelled)"
     try:

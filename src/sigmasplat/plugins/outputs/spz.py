@@ -14,7 +14,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sigmasplat.api import (
@@ -29,8 +28,6 @@ from sigmasplat.api import (
     to_bytes,
 )
 
-HALF_TURN = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
-"""By 180° about x, from axes x right, y down, z forward to x right, y up, z back, and back."""
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 WRITTEN_VERSION = 3
@@ -45,7 +42,7 @@ MAGNITUDES = (1 << 9) - 1
 
 def write_field(path: Path, field: GaussianField) -> None:
     """Write the splats atomically. Raises RunError if the file cannot be written or a position is too large."""
-    values = SplatValues.of(field.moved(HALF_TURN))
+    values = SplatValues.of(field).turned_about_x()
     values = values.ordered(morton_order(values.means))
     farthest_m = float(np.abs(values.means).max(initial=0.0))
     if not farthest_m * STEPS_PER_M <= LARGEST_FIXED:  # also if it is nan
