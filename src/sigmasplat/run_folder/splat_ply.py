@@ -61,27 +61,26 @@ def _columns(field: GaussianField, plain: bool, std: SplatStd | None) -> list[st
     return [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
 
 
-def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: slice) -> NDArray[np.void]:
+def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: slice) -> NDArray[np.float32]:
     """Return some splats as rows of a file with these columns."""
     params = field.params[part].detach().cpu().numpy().astype(np.float32)
-    rows = np.zeros(len(params), np.dtype([(name, "<f4") for name in columns]))
+    rows, at = np.zeros((len(params), len(columns)), "<f4"), {name: i for i, name in enumerate(columns)}
+
+    def fill(names: Sequence[str], values: NDArray[np.float32]) -> None:
+        rows[:, [at[name] for name in names]] = values
+
     for group in (group for group, names in PLY_COLUMNS.items() if names[0] in columns):
         values = params[:, COLUMNS[group]]
         if group == "colors":
             values = ((values.astype(np.float64) - 0.5) / SH_C0).astype(np.float32)
-        _fill(rows, PLY_COLUMNS[group], values)
+        fill(PLY_COLUMNS[group], values)
     if "harmonics" in field.attributes:
         harmonics = field.attributes["harmonics"].params[part].detach().cpu().numpy()
         by_channel = harmonics.astype(np.float32).reshape(-1, harmonics.shape[1] // 3, 3).swapaxes(1, 2)
-        _fill(rows, [f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel.reshape(harmonics.shape))
+        fill([f"{REST}{i}" for i in range(harmonics.shape[1])], by_channel.reshape(harmonics.shape))
     if std is not None:
-        _fill(rows, STD_COLUMNS, np.stack([getattr(std, name)[part].numpy() for name in STD_COLUMNS], 1))
+        fill(STD_COLUMNS, np.stack([getattr(std, name)[part].numpy() for name in STD_COLUMNS], 1))
     return rows
-
-
-def _fill(rows: NDArray[np.void], names: Sequence[str], values: NDArray[np.float32]) -> None:
-    for i, name in enumerate(names):
-        rows[name] = values[:, i]
 
 
 def read_field(path: Path) -> GaussianField:

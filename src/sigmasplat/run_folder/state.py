@@ -7,7 +7,7 @@ A checksum refuses a damaged state before a run continues it.
 import dataclasses
 import json
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -120,15 +120,11 @@ class _Encoder:
 
     def _column(self, column: Column) -> str:
         """Return a column, whose values are not copied: most of a long state is in columns."""
-        if column.used.size > INLINE:
-            values: Any = {"array": str(len(self.tensors))}
-            self.tensors[values["array"]] = torch.from_numpy(column.used)
-        else:
-            values = self._array(column.used)
+        values = self._array(column.used, torch.from_numpy)
         fields = f'{{"values": {_json(values)}, "count": {len(column)}}}'
         return f'{{"object": "Column", "fields": {fields}}}'
 
-    def _array(self, value: Tensor | np.ndarray[Any, Any]) -> Any:
+    def _array(self, value: Tensor | np.ndarray[Any, Any], kept: Callable[..., Tensor] = torch.tensor) -> Any:
         kind = "tensor" if isinstance(value, Tensor) else "array"
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
         device = {"device": "cuda"} if isinstance(value, Tensor) and value.is_cuda else {}
@@ -136,7 +132,7 @@ class _Encoder:
             return {kind: array.tolist(), "type": str(array.dtype), "shape": list(array.shape)} | device
         if id(value) not in self.seen:
             name = str(len(self.tensors))
-            self.tensors[name] = torch.tensor(array)
+            self.tensors[name] = kept(array)
             self.seen[id(value)] = name, value  # keeps the object alive, so that its id is not used again
         return {kind: self.seen[id(value)][0]} | device
 

@@ -3,6 +3,7 @@
 Imports that load torch are inside the functions, so that `sigmasplat export --help` is fast.
 """
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -100,16 +101,14 @@ def _covariance(source: ExportSource, target: Path) -> str:
 
 
 def _colmap(source: ExportSource, target: Path, *, pictures: bool) -> str:
-    from sigmasplat.api import Screen
+    from sigmasplat.api import Screen, no_progress
     from sigmasplat.plugins.outputs.colmap import export_colmap
 
     reader = source.reader()
-    if not pictures:
-        count = export_colmap(reader, target)
-        return f"{count:,} views, no pictures (--pictures){reader.left_out()}"
-    with Screen().counting("pictures") as progress:
-        count = export_colmap(reader, target, True, progress)
-        return f"{count:,} views with their pictures{reader.left_out(keyframes=True)}"
+    with Screen().counting("pictures") if pictures else nullcontext(no_progress) as progress:
+        count = export_colmap(reader, target, pictures, progress)
+    what = " with their pictures" if pictures else ", no pictures (--pictures)"
+    return f"{count:,} views{what}{reader.left_out(keyframes=pictures)}"
 
 
 def _video(

@@ -216,31 +216,18 @@ def _ply(mesh: Mesh, note: str) -> bytes:
     if it is known, uchar filled (1 = closes a gap) if gaps were closed, faces as lists of int."""
     faces = np.zeros(len(mesh.faces), np.dtype([("count", "u1"), ("corners", "<i4", 3)]))
     faces["count"], faces["corners"] = 3, mesh.faces
-    vertices = _vertex_rows(mesh)
-    columns = [
-        f"{'uchar' if vertices.dtype[name].itemsize == 1 else 'float'} {name}" for name in vertices.dtype.names or ()
-    ]
+    groups: list[tuple[str, str, NDArray[Any] | None]] = [
+        ("x y z", "float", mesh.vertices), ("nx ny nz", "float", mesh.normals()),
+        ("red green blue", "uchar", _bytes(mesh)),
+        ("depth_std_m", "float", mesh.depth_std_m), ("filled", "uchar", mesh.filled),
+    ]  # fmt: skip
+    known = [(names.split(), kind, values) for names, kind, values in groups if values is not None]
+    vertices = np.zeros(len(mesh.vertices), [(names[0], f"<{PLY_TYPES[kind]}", len(names)) for names, kind, _ in known])
+    for names, _, values in known:
+        vertices[names[0]] = values.reshape(-1, len(names))
+    columns = [f"{kind} {name}" for names, kind, _ in known for name in names]
     corners = ("face", len(faces), ["list uchar int vertex_indices"])
     return header_of(("vertex", len(vertices), columns), corners, comment=note) + vertices.tobytes() + faces.tobytes()
-
-
-def _vertex_rows(mesh: Mesh) -> NDArray[np.void]:
-    """Return the vertices as rows of a PLY, with the columns that are known."""
-    groups: dict[str, NDArray[Any] | None] = {
-        "x y z": mesh.vertices, "nx ny nz": mesh.normals(), "red green blue": _bytes(mesh),
-        "depth_std_m": mesh.depth_std_m, "filled": mesh.filled,
-    }  # fmt: skip
-    columns = {
-        name: values if values.ndim == 1 else values[:, k]
-        for names, values in groups.items()
-        if values is not None
-        for k, name in enumerate(names.split())
-    }
-    kinds = {name: "<f4" if values.dtype.kind == "f" else "u1" for name, values in columns.items()}
-    rows = np.zeros(len(mesh.vertices), list(kinds.items()))
-    for name, values in columns.items():
-        rows[name] = values
-    return rows
 
 
 def _stl(mesh: Mesh, note: str) -> bytes:

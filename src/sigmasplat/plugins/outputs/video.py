@@ -194,7 +194,7 @@ class Film:
         the 99th of √V."""
         samples = zip(*(self._maps(pose) for pose in evenly_spread(list(poses), SAMPLES)), strict=True)
         _, depth_m, deviation, mapped = (np.stack(maps) for maps in samples)
-        return colormap.value_range(depth_m, mapped), (0.0, colormap.value_range(deviation, mapped)[1])
+        return colormap.value_range(depth_m, mapped), colormap.from_zero(deviation, mapped)
 
     def _maps(self, T_world_camera: Matrix) -> tuple[Floats, Floats, Floats, NDArray[np.bool_]]:
         """Return colour [H, W, 3] in [0, 1], depth Σwz / Σw in m, √V of the mean over the channels, and where there is

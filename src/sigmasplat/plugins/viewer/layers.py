@@ -57,7 +57,7 @@ def palette_range(pieces: Sequence[Piece]) -> tuple[float, float]:
     """Return the range of uncertainties that the palette covers: from 0 to a high percentile of the visible splats."""
     values = np.concatenate([np.empty(0, np.float32), *(uncertainties(piece).numpy() for piece in pieces)])
     visible = np.concatenate([np.empty(0, bool), *(p.field.opacities.numpy() >= MIN_VISIBLE_OPACITY for p in pieces)])
-    return 0.0, colormap.value_range(values, visible)[1]
+    return colormap.from_zero(values, visible)
 
 
 def splat_arrays(piece: Piece, span: tuple[float, float] | None, unsure: bool) -> SplatArrays:
@@ -180,7 +180,7 @@ def draw_legend(legend: Legend) -> colormap.Rgb:
 
 
 def _from_zero(values: Floats, valid: NDArray[np.bool_], unit: str) -> LayerImage:
-    return _mapped(values, valid, (0.0, colormap.value_range(values, valid)[1]), colormap.INFERNO, unit)
+    return _mapped(values, valid, colormap.from_zero(values, valid), colormap.INFERNO, unit)
 
 
 def _mapped(

@@ -46,3 +46,8 @@ def value_range(values: Values, valid: NDArray[np.bool_]) -> tuple[float, float]
         return 0.0, 1.0
     low, high = np.percentile(values[valid], (1.0, 99.0))
     return float(low), float(high)
+
+
+def from_zero(values: Values, valid: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return 0 and the 99th percentile of the valid values; (0, 1) if no value is valid."""
+    return 0.0, value_range(values, valid)[1]

@@ -54,11 +54,13 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
     depth_range = colormap.value_range(view.recorded_depth_m, view.valid)
     deviation, error = np.sqrt(view.uncertainty), np.sqrt(view.squared_error)
     mapped = view.alpha > COVERED_ALPHA
-    score, limits = view.scores(), _from_zero(error, view.valid)
-    unsure = coloured("uncertainty, root of V", deviation, mapped, _from_zero(deviation, mapped), colormap.INFERNO)
+    score, limits = view.scores(), colormap.from_zero(error, view.valid)
+    unsure = coloured(
+        "uncertainty, root of V", deviation, mapped, colormap.from_zero(deviation, mapped), colormap.INFERNO
+    )
     if view.predicted is not None:  # where the map is empty too
         everywhere, total = np.ones_like(mapped), np.sqrt(view.predicted.color)
-        limits = 0.0, max(limits[1], _from_zero(total, everywhere)[1])
+        limits = 0.0, max(limits[1], colormap.from_zero(total, everywhere)[1])
         unsure = coloured("predicted colour error", total, everywhere, limits, colormap.INFERNO)
     recorded, rendered = (to_bytes(color * 255.0) for color in (view.recorded, view.rendered))
     return [
@@ -68,11 +70,6 @@ def view_panels(view: ScoredView) -> list[ViewPanel]:
         unsure,
         coloured("error, RMS", error, view.valid, limits, colormap.INFERNO),
     ]
-
-
-def _from_zero(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> tuple[float, float]:
-    """Return 0 and the 99th percentile of the valid values."""
-    return 0.0, colormap.value_range(values, valid)[1]
 
 
 def coloured(
