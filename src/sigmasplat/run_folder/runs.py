@@ -1,7 +1,7 @@
 """Write and read the folder of a run, which is valid at any time."""
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
