@@ -68,7 +68,10 @@ def _locked(
             held.blocks -= 1
             if not held.blocks:
                 del _held[key]
-                _release(key, held.file)
+                if held.file is not None:
+                    with suppress(OSError):
+                        key.unlink() if _is(key, held.file) else None
+                    os.close(held.file)
 
 
 def _acquired(
@@ -99,15 +102,6 @@ def _acquired(
                 os.pwrite(file, f"{os.getpid()} {socket.gethostname()}\n".encode(), 0)
             return file
         os.close(file)  # another process removed the file at the end of its lock, just before this lock
-
-
-def _release(path: Path, file: int | None) -> None:
-    if file is None:
-        return
-    with suppress(OSError):
-        if _is(path, file):
-            path.unlink()
-    os.close(file)
 
 
 def _is(path: Path, file: int) -> bool:

@@ -131,8 +131,7 @@ class DiskStore:
     def probe(self, index: int, probe: int) -> Picture:
         """Read the images of one probe view. Raises RunError if the submap is missing or damaged."""
         with self._opened(index) as file:
-            color, depth_m = (file.get_slice(name)[probe] for name in ("probe_colors", "probe_depths_m"))
-            return Picture(color, depth_m)
+            return Picture(*(file.get_slice(name)[probe] for name in ("probe_colors", "probe_depths_m")))
 
     def truncate(self, count: int) -> None:
         """Remove all submaps except the first `count`, and incomplete files."""

@@ -94,8 +94,8 @@ def write_model(
     colors [P, 3] in [0, 1]. Raises RunError if the files cannot be written.
     """
     numbers = " ".join(f"{value:.12g}" for value in (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5))
-    written = f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n1 PINHOLE {camera.width} {camera.height} {numbers}\n"
-    write_text(folder / "cameras.txt", written)
+    head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n"
+    write_text(folder / "cameras.txt", f"{head}1 PINHOLE {camera.width} {camera.height} {numbers}\n")
     write_text(folder / "images.txt", _image_lines(names, T_world_camera))
     write_text(folder / "points3D.txt", _point_lines(points, colors))
 

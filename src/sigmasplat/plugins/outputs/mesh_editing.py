@@ -6,7 +6,7 @@ collapse (Garland and Heckbert 1997), by fast-simplification.
 """
 
 from collections import defaultdict
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,14 +31,13 @@ OUTWARD = 0.3
 hole in a plane, 0 at the rim of a cup, and −1 at the outer border of a part."""
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+class Patch(NamedTuple):
     """A patch of a loop: numbers of the loop's vertices [n]; positions of the new ones [m, 3]; faces [f, 3] with the
     numbers 0 … n − 1 for the loop and n … n + m − 1 for the new ones; colours and standard deviations of the new ones,
     None if the mesh has none."""
 
     loop: Indices
-    points: Matrix
+    vertices: Matrix
     faces: Indices
     colors: Matrix | None
     depth_std_m: Matrix | None
@@ -197,21 +196,18 @@ def _joined(mesh: Mesh, patches: list[Patch]) -> Mesh:
         return mesh
     start, faces = len(mesh.vertices), [mesh.faces.astype(np.int64)]
     for patch in patches:
-        faces.append(np.concatenate([patch.loop, start + np.arange(len(patch.points))])[patch.faces])
-        start += len(patch.points)
+        faces.append(np.concatenate([patch.loop, start + np.arange(len(patch.vertices))])[patch.faces])
+        start += len(patch.vertices)
 
-    def with_new(values: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-        return np.concatenate([values, *(getattr(patch, name).astype(np.float32) for patch in patches)])
+    def with_new(name: str) -> NDArray[np.float32] | None:
+        parts = [getattr(each, name) for each in (mesh, *patches)]
+        return None if parts[0] is None else np.concatenate(parts).astype(np.float32)
 
+    vertices = with_new("vertices")
+    assert vertices is not None
     marks = np.zeros(len(mesh.vertices), bool) if mesh.filled is None else mesh.filled
-    return replace(
-        mesh,
-        vertices=with_new(mesh.vertices, "points"),
-        faces=np.concatenate(faces).astype(np.int32),
-        colors=None if mesh.colors is None else with_new(mesh.colors, "colors"),
-        depth_std_m=None if mesh.depth_std_m is None else with_new(mesh.depth_std_m, "depth_std_m"),
-        filled=np.concatenate([marks, np.ones(start - len(marks), bool)]),
-    )
+    marks = np.concatenate([marks, np.ones(start - len(marks), bool)])
+    return Mesh(vertices, np.concatenate(faces).astype(np.int32), with_new("colors"), with_new("depth_std_m"), marks)
 
 
 def _dot(a: Matrix, b: Matrix) -> Matrix:
@@ -245,7 +241,7 @@ def decimated(mesh: Mesh, triangles: int) -> Mesh:
         sums = np.bincount(nearest, values, len(small.vertices))
         return np.where(count > 0, sums / np.maximum(count, 1), values[own]).astype(np.float32)
 
-    colors = None if mesh.colors is None else np.stack([averaged(channel) for channel in mesh.colors.T], 1)
+    colors = None if mesh.colors is None else np.stack([*map(averaged, mesh.colors.T)], 1)
     std = None if mesh.depth_std_m is None else averaged(mesh.depth_std_m)
     filled = None if mesh.filled is None else averaged(mesh.filled.astype(np.float32)) > 0.5
     return Mesh(small.vertices, small.faces, colors, std, filled)

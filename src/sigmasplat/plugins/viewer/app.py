@@ -237,7 +237,7 @@ class ViewerApp:
         snapshot = self._snapshot
         if snapshot is None or row >= len(snapshot.path):
             return
-        self._go(client, snapshot, row)
+        self._go(client, row)
         image, missing = None, "its image was not kept"
         try:
             image = snapshot.image(row)
@@ -246,15 +246,14 @@ class ViewerApp:
         self.panel.show_image(f"frame {row}" if image is not None else f"frame {row}: {missing}", image)
 
     def _look_from(self, client: viser.ClientHandle) -> None:
-        snapshot = self._snapshot
-        if snapshot is not None and len(snapshot.path):
-            self._go(client, snapshot, min(self.panel.row.value, len(snapshot.path) - 1))
+        self._go(client, self.panel.row.value)
 
-    def _go(self, client: viser.ClientHandle, snapshot: Snapshot, row: int) -> None:
-        """Move a browser's camera to the pose of a frame."""
-        with client.atomic():
-            move_camera(client.camera, snapshot.path.T_world_camera[row])
-        self.changed()
+    def _go(self, client: viser.ClientHandle, row: int) -> None:
+        """Move a browser's camera to the pose of a frame, or to that of the last one."""
+        if self._snapshot is not None and len(self._snapshot.path):
+            with client.atomic():
+                move_camera(client.camera, self._snapshot.path.T_world_camera[: row + 1][-1])
+            self.changed()
 
 
 def _frame_text(snapshot: Snapshot, row: int) -> str:

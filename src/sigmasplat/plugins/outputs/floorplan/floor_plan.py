@@ -120,9 +120,8 @@ def floor_plan(
         grid.add_rays(to_floor(sample.points), to_floor(sample.T_world_camera[None, :3, 3])[0])
     for sample in samples:
         grid.add_points(to_floor(sample.points), sample)
-    alpha, depth_sigma_m, wrong_share = grid.means()
-    maps = grid.kinds(), alpha, depth_sigma_m, wrong_share
-    return FloorPlan(cell_m, grid.origin_m, T_floor_world, *maps, path[:, :2])
+    alpha, depth_m, wrong = grid.means()
+    return FloorPlan(cell_m, grid.origin_m, T_floor_world, grid.kinds(), alpha, depth_m, wrong, path[:, :2])
 
 
 def run_floor_plan(
