@@ -36,9 +36,7 @@ if TYPE_CHECKING:
 RUNS = Path("runs")
 
 
-def new_folder(
-    out: Path | None, config: Config, source: Source, overwrite: bool = False, **facts: Any
-) -> RunFolder:  # fmt: skip
+def new_folder(out: Path | None, config: Config, source: Source, overwrite: bool = False, **facts: Any) -> RunFolder:
     """Create a run folder as `new_run` does, without its lock."""
     with new_run(out, config, source, overwrite, **facts) as folder:
         return folder

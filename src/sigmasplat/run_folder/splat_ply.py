@@ -47,18 +47,14 @@ def write_field(path: Path, field: GaussianField, *, plain: bool = False, std: S
     `std` adds its two columns unless `plain`. Raises RunError if the file cannot be written.
     """
     known = None if plain else std
-    names = _columns(field, plain, known)
+    with_harmonics = plain or "harmonics" in field.attributes
+    rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if with_harmonics else 0)]
+    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(() if std is None else STD_COLUMNS)]
+    names = [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(header_of(("vertex", len(field), [f"float {name}" for name in names])))
         for first in range(0, len(field), AT_ONCE):
             file.write(_rows(field, known, names, slice(first, first + AT_ONCE)).tobytes())
-
-
-def _columns(field: GaussianField, plain: bool, std: SplatStd | None) -> list[str]:
-    with_harmonics = plain or "harmonics" in field.attributes
-    rest = [f"{REST}{i}" for i in range(ATTRIBUTES["harmonics"] if with_harmonics else 0)]
-    ours = [] if plain else [*PLY_COLUMNS["log_variances"], *(() if std is None else STD_COLUMNS)]
-    return [*BEFORE_HARMONICS, *rest, *AFTER_HARMONICS, *ours]
 
 
 def _rows(field: GaussianField, std: SplatStd | None, columns: list[str], part: slice) -> NDArray[np.float32]:

@@ -96,21 +96,12 @@ def write_model(
     numbers = " ".join(f"{value:.12g}" for value in (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5))
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n"
     write_text(folder / "cameras.txt", f"{head}1 PINHOLE {camera.width} {camera.height} {numbers}\n")
-    write_text(folder / "images.txt", _image_lines(names, T_world_camera))
-    write_text(folder / "points3D.txt", _point_lines(points, colors))
-
-
-def _image_lines(names: Sequence[str], T_world_camera: Matrix) -> str:
-    """Return two lines per image; the second one, for features, is empty."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D as (X, Y, POINT3D_ID)"]
     for number, (name, T) in enumerate(zip(names, se3.inverse(T_world_camera), strict=True), 1):
         pose = (*se3.quaternion_from_rotation(T[:3, :3]), *T[:3, 3])
-        lines += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}", ""]
-    return "\n".join(lines) + "\n"
-
-
-def _point_lines(points: Points, colors: Points) -> str:
-    """Return one line per point; its error is 0 and its track is empty."""
+        lines += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}", ""]  # no features
+    write_text(folder / "images.txt", "\n".join(lines) + "\n")
     rows = zip(points.tolist(), to_bytes(colors * 255.0).tolist(), strict=True)
-    lines = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
-    return "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n" + "".join(lines)
+    made = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
+    head = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
+    write_text(folder / "points3D.txt", head + "".join(made))

@@ -162,9 +162,7 @@ class ViewerApp:
             rows = lines.keyframes_to_show(path, row) if shown else ()
             self.scene.show_keyframes(snapshot.camera, {row: path.T_world_camera[row] for row in rows})
 
-    def _draw_layer(
-        self, client: viser.ClientHandle, snapshot: Snapshot, pieces: tuple[Piece, ...]
-    ) -> Legend | None:  # fmt: skip
+    def _draw_layer(self, client: viser.ClientHandle, snapshot: Snapshot, pieces: tuple[Piece, ...]) -> Legend | None:
         """Render the selected layer from a browser's viewpoint as the background of its scene; return its legend."""
         key, c, layer = ("layer", client.client_id), client.camera, self.panel.layer
         if layer is None:

@@ -113,7 +113,10 @@ def floor_plan(
         raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
     samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
     T_floor_world = floor_frame(samples, up)
-    to_floor = partial(_transformed, T_floor_world)
+
+    def to_floor(points: NDArray[np.floating]) -> Matrix:
+        return np.asarray(points.astype(np.float64) @ T_floor_world[:3, :3].T + T_floor_world[:3, 3])
+
     path = to_floor(trajectory.T_world_camera[:, :3, 3])
     grid = _Cells.around([to_floor(sample.points) for sample in samples], path, cell_m)
     for sample in samples:
@@ -144,10 +147,6 @@ def run_floor_plan(
         field, path, camera, cell_m=cell_m, renderer=FieldRenderer(config.render, config.backend),
         predictor=predictor, up=up_of(path.T_world_camera, run.facts(), up), progress=progress,
     )  # fmt: skip
-
-
-def _transformed(T: Matrix, points: NDArray[np.floating]) -> Matrix:
-    return np.asarray(points.astype(np.float64) @ T[:3, :3].T + T[:3, 3])
 
 
 class _Cells:
