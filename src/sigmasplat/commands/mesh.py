@@ -17,22 +17,23 @@ MeshAxes = Annotated[Literal["y-up", "z-up", "y-down", "camera"] | None, arg(
     "run's path; all but camera are levelled (docs/exports.md)", "(default: y-up; mesh.ply in RUN: camera)",
 )]  # fmt: skip
 
+Triangles = Annotated[int | None, Range(0), arg(
+    "N", "largest number of triangles; 0 = no limit", "(default: 300000; with a texture 60000)",
+)]  # fmt: skip
+FillGaps = Annotated[float, Range(0), arg(
+    "M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
+)]  # fmt: skip
+MeshFile = Annotated[Path | None, arg(
+    "FILE", "file to write: .glb or .usdz (textured), .ply or .stl (no colours)", "(default: mesh.ply in RUN)",
+)]  # fmt: skip
+
 
 def make_mesh(
     run: options.RunPath, voxel_m: options.VoxelM = None,
-    triangles: Annotated[int | None, Range(0), arg(
-        "N", "largest number of triangles; 0 = no limit", "(default: 300000; with a texture 60000)",
-    )] = None,
+    triangles: Triangles = None,
     texture: Annotated[bool, flag("colour the vertices of a GLB instead of giving it a texture")] = True,
     axes: MeshAxes = None, up: options.UpEdge = "auto",
-    fill_gaps: Annotated[float, Range(0), arg(
-        "M", "close gaps that are at most M metres across by smooth patches, which have a high depth_std_m; 0 = none",
-    )] = 0.0,
-    out: Annotated[
-        Path | None,
-        arg("FILE", "file to write: .glb or .usdz (textured), .ply or .stl (no colours)", "(default: mesh.ply in RUN)"),
-    ] = None,
-    overwrite: options.Overwrite = False,
+    fill_gaps: FillGaps = 0.0, out: MeshFile = None, overwrite: options.Overwrite = False,
 ) -> int:  # fmt: skip
     """Extract a coloured triangle mesh from a run's map, upright and in metres.
 
@@ -48,16 +49,15 @@ def make_mesh(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import MESH, RunFolder
 
-    screen, folder, target = Screen(), RunFolder.open(run), out or run / MESH
+    screen, reader, target = Screen(), RunReader(RunFolder.open(run)), out or run / MESH
     check_ending(target)
     texture = _has_texture(target, texture, axes)
     triangles = (60_000 if texture else 300_000) if triangles is None else triangles
     chosen: Axes = axes or ("y-up" if out else "camera")  # the run's own mesh.ply has the axes of its other files
     refuse_existing(out, overwrite)
-    reader = RunReader(folder)
     prepare_torch()
-    with output_locked(out, screen.warn) if out else folder.locked(screen.warn):
-        fusion_input = FusionInput.at(folder, reader.camera)
+    with output_locked(out, screen.warn) if out else reader.run.locked(screen.warn):
+        fusion_input = FusionInput.at(reader.run, reader.camera)
         with screen.counting("surface") as progress:
             surface = fusion_input.surface(voxel_m, progress=progress)
         seen, surface = len(surface.vertices), filled(surface, fill_gaps)
