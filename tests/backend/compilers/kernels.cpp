@@ -189,7 +189,7 @@ static void run_view(const Kernels& k, int features, BlendOptions options, int d
     out[name + " twist"] = floats_of(twist, 6);
     const Numbers rates = Draw{3}.many(ROW, 1e-3f, 1e-2f);
     const AdamOptions adam{rates.data(), 0.9f, 0.999f, 1e-3f, 5};
-    const HarmonicsStep harmonics{fit.harmonics.data(), {fit.harmonics1.data(), fit.harmonics2.data(), fit.harmonics_last.data()}, degree, 5, 1e-3f, true};
+    const HarmonicsStep harmonics{fit.harmonics.data(), {fit.harmonics1.data(), fit.harmonics2.data(), fit.harmonics_last.data()}, degree, 5, 1e-3f};
     const double cost = k.view_step(context, fit.params.data(), g, {fit.moment1.data(), fit.moment2.data(), fit.last.data()}, adam,
                                     {0.1f, 0.2f, 9}, degree ? harmonics : HarmonicsStep{}, pull.data(), twist, seconds);
     out[name + " step cost and twist"] = floats_of(twist, 6);
@@ -285,7 +285,6 @@ static Results run(const Kernels& k, int threads) {
     run_view(k, 4, {1.f / 255.f, 1e-4f}, 0, "view", out);
     run_view(k, 7, {1.f / 255.f, 1e-4f}, 2, "view of degree 2", out);
     run_view(k, 7, {1.f / 255.f, 1e-4f, true}, 3, "view along rays", out);
-    run_view(k, 7, {1.f / 255.f, 1e-4f, true, 0.3f}, 0, "view with gate", out);
     run_losses(k, out);
     run_alignment(k, out);
     return out;
