@@ -186,7 +186,7 @@ def _key(run: Mapping[str, Any]) -> tuple[str, str, int]:
 def _read(path: Path) -> dict[str, Any]:
     """Read the file of an ablation. Raises RunError if it cannot be read or is another file."""
     stored = {"source": str, "path": str, "variant": str, "seed": int, "wall_s": float,
-              "figures": {"": (float, None, bool)}}  # fmt: skip
+              "figures": dict[str, float | bool | None]}  # fmt: skip
     content = read_text(path, RunError)
     with guarded(path, "give another --name", RunError):
         found = json.loads(content)

@@ -18,7 +18,6 @@ from sigmasplat.fit.compare import (
     CLOSE_SIGMA,
     FLAT,
     LEAST_PIXELS,
-    LEVEL,
     NOISE_M,
     NOTHING,
     STEP,
@@ -99,7 +98,7 @@ def noise_m(depth_m: Matrix, noise_per_m: float = NOISE_PER_M, scene_scale: floa
 
 def compare_in_numpy(reference: Pyramid, live: Pyramid, T_live_reference: Matrix) -> Comparison:
     """Return what `compare` returns, but for rounding."""
-    level = min(LEVEL, len(reference.cameras) - 1)
+    level = 0
     host, camera = reference.kernels.to_host, reference.cameras[level]
     depth, gray = (host(plane)[::STEP, ::STEP] for plane in (reference.depth[level], reference.gray[level]))
     v, u = np.nonzero(depth > 0)

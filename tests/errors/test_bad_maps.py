@@ -115,7 +115,7 @@ def sigmasplat(
         ("map.ply --out x.obj", "unknown ending of x.obj; end it in .ply,"),
         ("map.ply --out x", "or give --format; --plugin FILE.py adds others"),
         ("map.ply --out x.spz --format spt", "no format 'spt'; there are ply,"),
-        ("map.ply --out x.spz --format spt", ", plan; --plugin FILE.py adds others"),
+        ("map.ply --out x.spz --format spt", ", plan, html; --plugin FILE.py adds others"),
         ("map.ply --out x.txt", "map.ply is a file, which can be exported only as another map"),
         ("map.ply --out plain.ply", "plain.ply exists"),
         ("map.ply --out x.spz --plain", "--plain cannot be used with format spz, only with ply"),
