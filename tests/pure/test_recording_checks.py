@@ -89,6 +89,7 @@ def test_what_drifts_during_a_run_is_said_once_and_at_once(shaken: Motion, what:
         color = np.repeat(image[..., None], 3, axis=2)
         watch(Frame(i, i / 30.0, color, depth, Camera(80, 60, 60.0, 60.0, 39.5, 29.5)))
     assert not [line for line in watch.warnings() if "depth" in line]
+    assert all(small.base is None for _, *images in watch.recent for small in images), "whole images stay in memory"
     if what == "nothing":
         assert not said
         return

@@ -220,10 +220,8 @@ class FrontEnd:
         """Track the next frames relative to a keyframe, before the map has weights for its pixels; return what the map
         gets, unless the keyframe waits."""
         if not found.reads_late:
-            splats, connected = (
-                NOTHING if self.snapshot is None else self.snapshot.params,
-                found.connected and not self.found,
-            )
+            splats = NOTHING if self.snapshot is None else self.snapshot.params
+            connected = found.connected and not self.found
             T = found.T_world_camera
             found = replace(found, seen=fitted_keyframe(self.tracker, splats, view, found.seen, T, connected))
         self.tracker.follow(found.followed)

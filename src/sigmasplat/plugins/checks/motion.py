@@ -213,10 +213,10 @@ def reduced(color: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def thinned(depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return every k-th reading of a depth image [H, W], about `WIDTH` pixels wide."""
+    """Return a copy of every k-th reading of a depth image [H, W], about `WIDTH` pixels wide."""
     step = max(1, depth_m.shape[1] // WIDTH)
     height, width = (size // step * step for size in depth_m.shape)
-    return depth_m[step // 2 : height : step, step // 2 : width : step]
+    return depth_m[step // 2 : height : step, step // 2 : width : step].copy()
 
 
 def _varying(energy: Numbers) -> Numbers:

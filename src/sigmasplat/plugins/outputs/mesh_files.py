@@ -32,9 +32,8 @@ from sigmasplat.api import (
     replacing,
     to_bytes,
 )
-from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh
+from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh, vertex_colors
 
-GRAY = 0.7
 Values = NDArray[np.floating]
 NUMBERS = {np.dtype(code): number for code, number in (("<u1", 5121), ("<u2", 5123), ("<u4", 5125), ("<f4", 5126))}
 TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
@@ -112,9 +111,8 @@ def linear(srgb: Values) -> NDArray[np.float64]:
 
 
 def _linear_colors(mesh: Mesh) -> NDArray[np.uint16]:
-    srgb = np.full(mesh.vertices.shape, GRAY) if mesh.colors is None else mesh.colors
-    rgba = np.ones((len(srgb), 4))
-    rgba[:, :3] = linear(np.clip(srgb, 0.0, 1.0))
+    rgba = np.ones((len(mesh.vertices), 4))
+    rgba[:, :3] = linear(np.clip(vertex_colors(mesh), 0.0, 1.0))
     return np.rint(rgba * 65535.0).astype("<u2")
 
 
@@ -218,7 +216,7 @@ def _ply(mesh: Mesh, note: str) -> bytes:
     faces["count"], faces["corners"] = 3, mesh.faces
     groups: list[tuple[str, str, NDArray[Any] | None]] = [
         ("x y z", "float", mesh.vertices), ("nx ny nz", "float", mesh.normals()),
-        ("red green blue", "uchar", _bytes(mesh)),
+        ("red green blue", "uchar", to_bytes(vertex_colors(mesh) * 255.0)),
         ("depth_std_m", "float", mesh.depth_std_m), ("filled", "uchar", mesh.filled),
     ]  # fmt: skip
     known = [(names.split(), kind, values) for names, kind, values in groups if values is not None]
@@ -261,11 +259,6 @@ def _usdz(mesh: Mesh, note: str) -> bytes:
             part.extra = struct.pack("<HH", 0x1986, fill) + bytes(fill)
             archive.writestr(part, content)
     return file.getvalue()
-
-
-def _bytes(mesh: Mesh) -> NDArray[np.uint8]:
-    """Return the vertices' colours as bytes [V, 3]; gray if the mesh has no colours."""
-    return to_bytes((np.full(mesh.vertices.shape, GRAY, np.float32) if mesh.colors is None else mesh.colors) * 255.0)
 
 
 _FORMATS = {".ply": _ply, ".glb": _glb, ".stl": _stl, ".usdz": _usdz}

@@ -50,6 +50,11 @@ class TexturedMesh(Mesh):
     image: bytes = b""
 
 
+def vertex_colors(mesh: Mesh) -> Floats:
+    """Return the colours of the vertices [V, 3] in [0, 1]; gray if the mesh has none."""
+    return np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors
+
+
 def textured(mesh: Mesh, views: Iterable[FusionView], total: int, config: Config, progress: Progress) -> TexturedMesh:
     """Return a mesh in the world with a texture of these views; vertices at the edges of charts are doubled.
 
@@ -68,8 +73,8 @@ def textured(mesh: Mesh, views: Iterable[FusionView], total: int, config: Config
         rows, colors, weight = _seen(at, mesh, points, faces, config)
         sums[rows] += np.column_stack([colors * weight[:, None], weight])
         progress(done, total)
-    colors = np.full_like(mesh.vertices, 0.7) if mesh.colors is None else mesh.colors
-    shown = np.where(sums[:, 3:] > 0, sums[:, :3] / np.maximum(sums[:, 3:], 1e-30), at_texels(colors))
+    colors = at_texels(vertex_colors(mesh))
+    shown = np.where(sums[:, 3:] > 0, sums[:, :3] / np.maximum(sums[:, 3:], 1e-30), colors)
     image, empty = np.zeros((size * size, 3), np.uint8), np.ones(size * size, bool)
     image[places], empty[places] = np.rint(255.0 * shown).clip(0, 255), False
     nearest = distance_transform_edt(empty.reshape(size, size), return_distances=False, return_indices=True)

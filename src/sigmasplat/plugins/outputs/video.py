@@ -158,11 +158,10 @@ class Film:
         """Return a film of a run, as described in `export_video`."""
         field = reader.run.read_map()
         known = reader.run.uncertainty_of(field)
-        std = None if known is None else known.std
         if std_below_m is not None:
-            kept = kept_below(reader.run.path, std, std_below_m)
+            kept = kept_below(reader.run.path, None if known is None else known.std, std_below_m)
         else:
-            kept = sure(field, None if uncertain else std, reader.valid_path().T_world_camera[:, :3, 3])
+            kept = sure(field, None if uncertain else known, reader.valid_path().T_world_camera[:, :3, 3])
         seen_from = None if known is None or uncertain else known.splats[kept][:, 3:]
         return cls(field.part(kept), camera, renderer, seen_from)
 
@@ -237,7 +236,7 @@ def orbit_view(film: Film, path: Trajectory, images: int, up: Up | None = None) 
 
 def _orbit_around(points: Matrix, film: Film, T_world_floor: Matrix, images: int) -> Matrix:
     """Return T_floor_camera [images, 4, 4] of an orbit that shows points [P, 3] in the frame of the floor."""
-    camera = film.camera.resized(WIDTH_PX, max(2, round(film.camera.height * WIDTH_PX / film.camera.width)))
+    camera = film_camera(film.camera, WIDTH_PX)
     small, turn = replace(film, camera=camera), 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     center, (_, ahead, up) = np.median(points, axis=0), np.eye(3)
     most, best = -1.0, np.empty((0, 4, 4))

@@ -89,7 +89,7 @@ def _open(
         times_s, times = stamps_s, read._replace(value="timestamp of each frame")
     order = np.argsort(times_s)
     frames, files, times_s = [frames[i] for i in order], [files[i] for i in order], times_s[order]
-    sure = [folder / frame["confidence"] if "confidence" in frame else None for frame in frames]
+    sure = [listed_file(folder, name) if isinstance(name := f.get("confidence"), str) else None for f in frames]
     images = [ImagePair(float(t), *pair, confidence=c) for t, pair, c in zip(times_s, files, sure, strict=True)]
     key = next((key for key in UNIT_KEYS if key in fields), "")
     units = round(1.0 / check_positive(path, key, json_number(path, fields, key, METRES_PER_UNIT)), 6)

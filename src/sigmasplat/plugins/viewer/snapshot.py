@@ -27,8 +27,8 @@ class Piece:
     """A part of the map: splats in their own frame, and the pose T_world_piece of that frame.
 
     submap: its number, or None for the final map. If splats change, the piece gets a new field object; an unchanged
-    object means unchanged splats. uncertainty: how sure the splats are, sure: which are shown by default, bool [N];
-    None if it was not measured.
+    object means unchanged splats. uncertainty: how sure the splats are, None if it was not measured; sure: which are
+    shown by default, bool [N], None for all.
     """
 
     submap: int | None

@@ -79,9 +79,7 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
 
 def final_piece(splats: GaussianField, known: MapUncertainty | None, T_world_camera: Matrix) -> Piece:
     """Return a final map as a piece; T_world_camera [F, 4, 4]: the poses that it was made from."""
-    std = None if known is None else known.std
-    mask = None if std is None else sure(splats, std, T_world_camera[:, :3, 3])
-    return Piece(None, splats, uncertainty=known, sure=mask)
+    return Piece(None, splats, uncertainty=known, sure=sure(splats, known, T_world_camera[:, :3, 3]))
 
 
 def opening(piece: Piece, path: Trajectory, camera: Camera, config: Config, up: Up) -> Opening | None:
@@ -93,9 +91,8 @@ def opening(piece: Piece, path: Trajectory, camera: Camera, config: Config, up: 
         T_floor_world = floor_frame(samples, up)
     except SigmaSplatError:
         return None
-    T = path.T_world_camera[best_view(field, list(path.T_world_camera), camera, renderer)]
-    nearest = min(samples, key=lambda sample: float(np.abs(sample.T_world_camera - T).max()))
-    ahead_m = float(np.median((nearest.points - T[:3, 3]) @ T[:3, 2]))
+    T, points = samples[best := best_view(samples)].T_world_camera, samples[best].points
+    ahead_m = float(np.median((points - T[:3, 3]) @ T[:3, 2]))
     return Opening(T, ahead_m, 2.0 * float(np.arctan(0.5 * camera.height / camera.fy)), T_floor_world[2, :3])
 
 

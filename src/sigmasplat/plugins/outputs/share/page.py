@@ -29,6 +29,7 @@ from sigmasplat.api import (
     RunError,
     SplatStd,
     SplatValues,
+    evenly_spaced,
     harmonics,
     morton_order,
     se3,
@@ -39,7 +40,8 @@ from sigmasplat.api import (
 from sigmasplat.plugins.evaluation.run_views import refined_fx
 from sigmasplat.plugins.outputs.axes import Edge, levelled, transform_to
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
-from sigmasplat.plugins.outputs.first_look import best_view, sure
+from sigmasplat.plugins.outputs.first_look import VIEWS, best_view, sure
+from sigmasplat.plugins.outputs.floorplan.ground import sample_surfaces
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 PLANES = 20
@@ -57,15 +59,17 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
 
     Raises RunError without a map or a path, or if the map has nan or inf.
     """
-    run, path = reader.run, reader.valid_path().T_world_camera
-    known = run.uncertainty_of(field := run.read_map())
+    run, trajectory = reader.run, reader.valid_path()
+    path, known = trajectory.T_world_camera, run.uncertainty_of(field := run.read_map())
     flat, std = flat_colours(field, known), None if known is None else known.std
-    shown = sure(field, std, path[:, :3, 3])
+    shown = sure(field, known, path[:, :3, 3])
     frames = [row for row in reader.valid_frames() if reader.frames.log[row]["is_keyframe"]]
-    poses = reader.poses_of(frames).T_world_camera if frames else path
+    keyframes = reader.poses_of(frames) if frames else trajectory
+    poses = keyframes.T_world_camera
     field.keep(shown)
     renderer = FieldRenderer(reader.config.render, reader.config.backend)
-    start = best_view(field, list(poses), reader.camera, renderer)
+    best = best_view([*sample_surfaces(field, keyframes, reader.camera, renderer, VIEWS)])
+    start = int(evenly_spaced(len(poses), VIEWS)[best])
     with torch.inference_mode():
         poster = renderer(field, reader.camera, se3.inverse(poses[start])).color.cpu().clamp(0.0, 1.0).numpy()
     R_floor_world, said, _ = levelled(reader, up)
@@ -81,7 +85,7 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
         "width": reader.camera.width, "height": reader.camera.height, "focal": reader.camera.fx,
         "refined_fx": refined_fx(reader.config, Camera(**run.facts()["camera"])), "palette": INFERNO.tolist(),
     }  # fmt: skip
-    time_s = float(reader.valid_path().timestamps_s[0])
+    time_s = float(trajectory.timestamps_s[0])
     if time_s < 1e9:  # September 2001: it does not count from 1970, so it does not tell the day
         time_s = (run.path / "run.json").stat().st_mtime
     day = datetime.fromtimestamp(time_s, UTC)
