@@ -238,6 +238,14 @@ def test_an_opengl_camera_looks_along_minus_z_with_y_up(tmp_path):
     assert top.tolist() == [0.0, 1.0, -2.0, 1.0]
 
 
+def test_a_confidence_that_is_no_name_of_an_image_is_ignored(tmp_path):
+    folder = layouts.nerfstudio(tmp_path, sample())
+    frames = json.loads((folder / "transforms.json").read_text())["frames"]
+    plain = open_source(folder).frame(0).depth_m
+    transformed(folder, frames=[frame | {"confidence": 0.9} for frame in frames])
+    assert (open_source(folder).frame(0).depth_m == plain).all()
+
+
 def test_intrinsics_per_frame_or_as_field_of_view(tmp_path):
     folder = layouts.nerfstudio(tmp_path, sample())
     fields = json.loads((folder / "transforms.json").read_text())
