@@ -9,9 +9,10 @@ import pytest
 
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override, split_settings
+from sigmasplat.plugins.evaluation.failure import rerun_command
 from sigmasplat.plugins.evaluation.report.advice import advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import trajectory_charts
-from sigmasplat.plugins.evaluation.report.page import rerun_command, write_page
+from sigmasplat.plugins.evaluation.report.page import write_page
 from sigmasplat.plugins.evaluation.report.summary import (
     result_sentence,
     verdicts,

@@ -247,7 +247,7 @@ def _run_and_score(
     if run_options.evaluate:
         score(screen, folder, source)
     else:
-        from sigmasplat.plugins.evaluation.failure import failure  # scipy.stats is not loaded before the frames
+        from sigmasplat.plugins.evaluation.failure import failure
 
         kept, failed = f"{outcome.summary()}: {folder.path}", failure(folder, source)
         screen.next_commands([f"sigmasplat eval {folder.path}"], kept, failed)

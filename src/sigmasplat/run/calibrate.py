@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.stats import t as t_distribution
+from scipy.special import stdtrit
 
 from sigmasplat.config import Config
 from sigmasplat.data.camera_errors import KNOWN_NONE, CameraErrors, corner_share
@@ -190,7 +190,7 @@ def falloff_of(pairs: Sequence[Pair], values: Matrix) -> tuple[float, float]:
 
     parts = [best([seen[i] for i in part]) for part in np.array_split(np.arange(len(seen)), BLOCKS)]
     found, std = best(seen), float(np.hypot(np.std(parts, ddof=1) / BLOCKS**0.5, GRAY_STEP))
-    return (found if abs(found) > std * t_distribution.ppf((1.0 + LEVEL) / 2.0, BLOCKS - 1) else 0.0), std
+    return (found if abs(found) > std * stdtrit(BLOCKS - 1, (1.0 + LEVEL) / 2.0) else 0.0), std
 
 
 def _spread(differences: Matrix) -> float:

@@ -1,6 +1,8 @@
 """Say that a run failed, or that its scale is wrong: what is known of the cause, and the commands to try next."""
 
+import shlex
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -8,14 +10,18 @@ from sigmasplat.api import (
     APART,
     KNOWN_UNITS_PER_METRE,
     LOST,
+    Config,
     RunFolder,
     Source,
     Trajectory,
+    default_preset,
     depth_warning,
+    differences,
     format_ranges,
+    is_preset,
+    preset,
 )
 from sigmasplat.plugins.evaluation.metrics.trajectory import absolute_error, align_similarity, pair_poses
-from sigmasplat.plugins.evaluation.report.page import rerun_command
 
 MOST_LOST = 1.0 / 3.0
 CAUSES = {
@@ -72,3 +78,14 @@ def wrong_scale(run: RunFolder, source: Source, scale: float | None) -> dict[str
     origin = source.origins.get("depth unit")
     said += f": {what} is probably wrong ({origin.origin if origin else 'now'} {units:g} per metre; {remedy})"
     return {said: [f"{rerun_command(config, run.facts())} {remedy}"]}
+
+
+def rerun_command(config: Config, facts: dict[str, Any], command: str = "run") -> str:
+    """Return the command that makes the run again, or inspects its recording: its preset, and what differs from it."""
+    words, of_run = ["sigmasplat", command, str(facts.get("source_path") or "PATH")], command == "run"
+    if of_run and (onto := facts.get("onto")):
+        words += ["--onto", str(onto["run"])]
+    pairs = differences(config, preset(config.name)) if is_preset(config.name) else []
+    if of_run and config.name != default_preset() and is_preset(config.name):
+        words += ["--preset", config.name]
+    return shlex.join([*words, *(w for p in pairs if of_run or p.startswith("input.") for w in ("--set", p))])

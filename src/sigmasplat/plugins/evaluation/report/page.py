@@ -7,25 +7,13 @@ import base64
 import html
 import io
 import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from sigmasplat.api import (
-    Camera,
-    Config,
-    RunFolder,
-    RunFrames,
-    SigmaSplatError,
-    Trajectory,
-    default_preset,
-    differences,
-    is_preset,
-    preset,
-    sensor_said,
-)
+from sigmasplat.api import Camera, RunFolder, RunFrames, SigmaSplatError, Trajectory, sensor_said
+from sigmasplat.plugins.evaluation.failure import rerun_command
 from sigmasplat.plugins.evaluation.report import tables
 from sigmasplat.plugins.evaluation.report.advice import Advice, advice, next_commands
 from sigmasplat.plugins.evaluation.report.charts import Plot
@@ -70,17 +58,6 @@ def report_plan(run: RunFolder, path: Trajectory, camera: Camera) -> FloorPlan |
         return run_floor_plan(run, path, camera.prepared(settings.width, settings.crop_px))
     except SigmaSplatError:
         return None
-
-
-def rerun_command(config: Config, facts: dict[str, Any], command: str = "run") -> str:
-    """Return the command that makes the run again, or inspects its recording: its preset, and what differs from it."""
-    words, of_run = ["sigmasplat", command, str(facts.get("source_path") or "PATH")], command == "run"
-    if of_run and (onto := facts.get("onto")):
-        words += ["--onto", str(onto["run"])]
-    pairs = differences(config, preset(config.name)) if is_preset(config.name) else []
-    if of_run and config.name != default_preset() and is_preset(config.name):
-        words += ["--preset", config.name]
-    return shlex.join([*words, *(w for p in pairs if of_run or p.startswith("input.") for w in ("--set", p))])
 
 
 QUALITY, EFFORT = 86, 2
