@@ -1,8 +1,8 @@
 """Compare final maps with and without the last stage of refinement, which uses images of the camera's own size.
 
-Sequences × seeds; each is run twice, with `final.width` 0 and 8192, the camera's. Held-out views are scored at working
-size and at the camera's size, in the exposure of their frames, as metrics.json has them. The map without the stage is
-scored twice at the camera's size: rendered there, and with its working images enlarged (bicubic). Writes
+Sequences × seeds; each is run twice, with `final.width` 0 and as by default. Held-out views are scored at working size,
+of the submaps too, and at the camera's size, in the exposure of their frames, as metrics.json has them. The map without
+the stage is scored twice at the camera's size: rendered there, and with its working images enlarged (bicubic). Writes
 benchmarks/results/<name>-<machine>.json and prints a table.
 
 example: python benchmarks/full_resolution.py --sources livingroom --seeds 0
@@ -38,8 +38,10 @@ from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
 COLUMNS = {
-    "working_before": "working size, before", "working_after": "after", "rendered_before": "camera's size, before",
-    "enlarged_before": "before, enlarged", "after": "after", "gain": "gain over enlarged", "finish_s": "final map, s",
+    "submaps": "working size, submaps", "working_before": "before", "working_after": "after",
+    "depth_before_cm": "depth L1, cm, before", "depth_after_cm": "after", "rendered_before": "camera's size, before",
+    "enlarged_before": "before, enlarged", "after": "after", "gain": "gain over enlarged",
+    "finish_before_s": "final map, s, before", "finish_s": "after",
 }  # fmt: skip
 
 
@@ -48,7 +50,7 @@ class Options:
     """Compare final maps with and without the last stage of refinement, on images of the camera's size."""
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
-        "redkitchen", "livingroom", "synthetic:frames=200,width=640,height=480,noise=1",
+        "fr1_xyz", "redkitchen", "livingroom", "cubicles", "hololens",
     )  # fmt: skip
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, two runs for each")] = (0, 1, 2)
     limit: Annotated[int, arg(help="use at most this many frames; 0 = all")] = 0
@@ -101,16 +103,20 @@ def measured(source: str, seed: int, options: Options) -> dict[str, Any]:
     recorded, working = open_source(accuracy.located(source)).camera.width, preset(default_preset()).input.width
     if recorded <= working:
         raise SigmaSplatError(f"{source}: images are {recorded} pixels wide; give images wider than {working} pixels")
-    before, after = (finished_run(source, seed, width, options) for width in (0, 8192))
+    before, after = (finished_run(source, seed, width, options) for width in (0, preset(default_preset()).final.width))
     known = open_source(accuracy.located(source), before.config().input)
     rendered = evaluate(before, known, full_resolution=True)
     enlarged = evaluate(before, known, renderer=Enlarged(before.config()), full_resolution=True)
     refined = after.read_metrics()
     figures = {
+        "submaps": refined["held_out_submaps"]["psnr_db"],
         "working_before": held_out_db(rendered), "working_after": held_out_db(refined),
+        "depth_before_cm": 100 * rendered["held_out"]["depth_l1_m"],
+        "depth_after_cm": 100 * refined["held_out"]["depth_l1_m"],
         "rendered_before": held_out_db(rendered["full_resolution"]),
         "enlarged_before": held_out_db(enlarged["full_resolution"]),
-        "after": held_out_db(refined["full_resolution"]), "finish_s": refined["finish_s"],
+        "after": held_out_db(refined["full_resolution"]),
+        "finish_before_s": rendered["finish_s"], "finish_s": refined["finish_s"],
     }  # fmt: skip
     for run in (before, after):
         shutil.rmtree(run.path)
@@ -127,7 +133,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     """Return a table with a row per sequence: mean ± standard deviation over the seeds."""
     runs = measured["figures"]["runs"]
     rows = [
-        [source, *(spread([run[name] for run in runs if run["source"] == source and run[name] is not None])
+        [source, *(spread([run[name] for run in runs if run["source"] == source and run.get(name) is not None])
                    for name in COLUMNS)]
         for source in dict.fromkeys(run["source"] for run in runs)
     ]  # fmt: skip

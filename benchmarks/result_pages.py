@@ -70,7 +70,6 @@ PAGES = {
             Shown(
                 "full-resolution",
                 "The last stage of the final map uses the camera's own images: it gains over enlarged working images.",
-                without=("final map, s",),
             ),
             Shown(
                 "away_from_path",

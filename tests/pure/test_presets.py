@@ -372,7 +372,7 @@ def test_sigma_adds_to_fast_and_leaves_out_the_weights_of_tracking() -> None:
     uncertainty = {"mapping.iterations", "tracking.uncertainty", "primitives.uncertain_m2", "uncertainty.probes"}
     assert added == uncertainty | {
         "mapping.overlap_below", "input.denoise_depth", "tracking.features", "tracking.verify",
-        "final.iterations", "final.schedule", "mapping.lr_log_scales", "seeding.shape",
+        "final.iterations", "final.width", "final.schedule", "mapping.lr_log_scales", "seeding.shape",
         "mapping.divided", "mapping.first_iterations", "mapping.lr_pose_translation",
         "mapping.lr_pose_rotation",
         "registration.method", "registration.iterations",

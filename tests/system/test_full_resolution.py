@@ -38,7 +38,7 @@ ROOM = "synthetic:frames=120,width=160,height=120,noise=1"
 SETTINGS = {
     "input.width": "80", "input.limit": "24", "mapping.first_iterations": "30", "mapping.iterations": "8",
     "mapping.every": "3", "submaps.frames": "12", "final.iterations": "60", "registration.iterations": "2",
-    "final.width": "8192", "final.width_iterations": "100",
+    "final.width": "8192",
 }  # fmt: skip
 SAME = ("trajectory.txt", "map.ply", "checkpoint.safetensors")
 
@@ -76,8 +76,8 @@ def test_the_last_stage_is_sharper_at_both_sizes(slam: Slam) -> None:
     """Held-out frames at the size of the recording, where it also beats an enlarged image of the map before, and at
     working size, where the map needs the low-pass of the photos."""
     scores = dict[tuple[str, str], float]()
-    for name, steps in (("before", "0"), ("after", "600")):
-        config = settings(iterations="200", width_iterations=steps)
+    for name, width in (("before", "0"), ("after", "8192")):
+        config = settings(iterations="400", width=width)
         made = final_map(slam.store, slam.atlas.anchors, config, slam.view, np.random.default_rng(0))
         refined = FieldRenderer(config.render, config.backend, (made.field, made.refined_fx))
         plain = FieldRenderer(config.render, config.backend)
@@ -111,20 +111,20 @@ def test_keyframes_keep_photos_only_for_the_last_stage(slam: Slam) -> None:
 
 
 def test_the_progress_covers_the_last_stage() -> None:
-    config = settings(iterations="5", width_iterations="60")
+    config = settings(iterations="30")
     slam, told = Slam(config), list[tuple[int, int]]()
     slam.step(open_source(ROOM, config.input).frame(0))
     slam.finish(lambda done, total: told.append((done, total)))
     dones, totals = zip(*told, strict=True)
-    assert list(dones) == sorted(dones) and set(totals) == {dones[-1]} and dones[-1] >= 65
+    assert list(dones) == sorted(dones) and set(totals) == {dones[-1]} and dones[-1] >= 60
 
 
 def test_a_time_budget_covers_both_stages(slam: Slam, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each look at the clock takes a hundredth of a second. The stage at working size gets a third of the budget, and
-    the rates of the last stage fall in time, whatever the number of steps."""
+    """Each look at the clock takes a hundredth of a second. The stage at working size gets a third of the budget, the
+    last one the rest, whatever the number of steps, and its rates fall in time."""
     ticks = itertools.count(0.0, 0.01)
     monkeypatch.setattr("sigmasplat.final.refinement.time.perf_counter", lambda: next(ticks))
-    config = settings(iterations="100000", width_iterations="100000", seconds="12.0")
+    config = settings(iterations="50", seconds="12.0")
     told, rates = list[tuple[int, int]](), list[float]()
     fit = full_resolution.fit_field
 
@@ -138,15 +138,15 @@ def test_a_time_budget_covers_both_stages(slam: Slam, monkeypatch: pytest.Monkey
     made = final_map(
         slam.store, slam.atlas.anchors, config, slam.view, np.random.default_rng(0), lambda *at: told.append(at)
     )
-    assert made.refined_fx is not None and 100_000 < made.steps < 101_000
+    assert made.refined_fx is not None and made.steps > 2 * 50
     assert rates[0] == pytest.approx(4.0, rel=0.1) and rates == sorted(rates, reverse=True)
     assert rates[-1] == pytest.approx(0.4, rel=0.1)
     dones = [done for done, _ in told]
-    assert dones == sorted(dones) and told[-1] == (200_000, 200_000)
+    assert dones == sorted(dones) and told[-1] == (100, 100)
 
 
 def arguments(out: Path) -> list[str]:
-    long = SETTINGS | {"final.width_iterations": "1000"}  # so that there is time to kill it
+    long = SETTINGS | {"final.iterations": "600"}  # so that there is time to kill it
     changed = [word for key, value in long.items() for word in ("--set", f"{key}={value}")]
     return ["run", ROOM, "--out", str(out), "--no-eval", "--save-every", "0.001", *changed]
 

@@ -88,13 +88,11 @@ class FinalConfig(Section, name="final"):
     """Number of refinement steps between removals of splats with low opacity (`prune_opacity`)."""
     prune_opacity: ClassVar[float] = 0.005
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
-    width: Annotated[int, WIDTHS_PX] = 0
+    width: Annotated[int, WIDTHS_PX] = 640  # a phone's photo has ten times as many pixels, and costs ten times as much
     """Width of the images in the last stage of refinement in pixels, at most the recorded width, so that 8192 is the
-    camera's; 0 = no such stage, only working images are used. If it is above `input.width`, the colour of each keyframe
-    is kept at this size."""
-    width_iterations: Count = 8000
-    """Number of refinement steps of the stage with images of `width`, after those of `iterations`, if `iterations` is
-    above 0. Two thirds of them use working images, so that the map stays sharp at that size too."""
+    camera's; 0 = no such stage, only working images are used (papers). If it is above `input.width`, the colour of each
+    keyframe is kept at this size, and as many steps as `iterations` follow; with a time budget they go on until it
+    ends. Two thirds of them use working images, so that the map stays sharp at that size too."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
 

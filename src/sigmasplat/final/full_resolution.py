@@ -1,5 +1,6 @@
 """The last stage of the final map, after refinement at working size: refine it on images of the camera's own size."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -58,8 +59,7 @@ class PhotoReader:
 
 def working_seconds(keyframes: KeyframeReader, final: FinalConfig) -> float:
     """Return after how many seconds of the refinement the stage at working size ends; 0 = no time budget."""
-    shared = final.seconds and final.width_iterations and _photo_cameras(keyframes)
-    return final.seconds * WORKING_SHARE if shared else final.seconds
+    return final.seconds * (WORKING_SHARE if final.width and _photo_cameras(keyframes) else 1.0)
 
 
 def _photo_cameras(keyframes: KeyframeReader) -> list[Camera]:
@@ -87,25 +87,29 @@ def refine_on_photos(
     it is short. Calls `progress(steps done, total)`.
     """
     final = config.final
-    if not final.width_iterations or clock.is_over or not (cameras := _photo_cameras(keyframes)):
+    if not final.width or clock.is_over or not (cameras := _photo_cameras(keyframes)):
         return done, None
     large = _like(view, max(cameras, key=lambda camera: camera.width), config, None)
     view = _like(view, view.camera, config, large.camera.fx)
-    photos, total = PhotoReader(keyframes, large), final.iterations + final.width_iterations
+    photos, length = PhotoReader(keyframes, large), steps_of(clock, final)
     mapping = replace(refinement(config), lr_pose_translation=0.0, lr_pose_rotation=0.0)
     degree = min(final.sh_degree, final.iterations // final.sh_every)
     turns: list[tuple[View, PhotoReader | KeyframeReader]] = [(large, photos)] + [(view, keyframes)] * WORKING_TURNS
     done = max(done, final.iterations)
-    while done < total and not clock.is_over:
-        since = done - final.iterations
+    while (since := done - final.iterations) < length and not clock.is_over:
         of_view, images = turns[since // TURN_STEPS % len(turns)]
-        steps = range(done, min(done + TURN_STEPS - since % TURN_STEPS, total))
-        rates = (falling(mapping, clock.done(step - final.iterations, final.width_iterations)) for step in steps)
+        steps = range(done, int(min(done + TURN_STEPS - since % TURN_STEPS, final.iterations + length)))
+        rates = (falling(mapping, clock.done(step - final.iterations, length)) for step in steps)
         fit_field(field, of_view, _draw(images, steps, final, random, progress, clock), mapping, rates, degree=degree)
         field.keep(field.opacities > final.prune_opacity)
         done = steps.stop
-    progress(total, total)
+    progress(2 * final.iterations, 2 * final.iterations)
     return done, large.camera.fx
+
+
+def steps_of(clock: Clock, final: FinalConfig) -> float:
+    """Return the largest number of steps of this stage: without end if a time budget ends it."""
+    return math.inf if clock.ends_s else final.iterations
 
 
 def falling(mapping: MappingConfig, share: float) -> Rates:
@@ -121,8 +125,7 @@ def _draw(
     progress: Progress, clock: Clock,
 ) -> Iterator[Sequence[Keyframe]]:  # fmt: skip
     """Draw one keyframe per step, uniformly; call `progress` before each."""
-    total = final.iterations + final.width_iterations
     for step in steps:
-        share = clock.done(step - final.iterations, final.width_iterations)
-        progress(final.iterations + round(share * final.width_iterations), total)
+        share = clock.done(step - final.iterations, steps_of(clock, final))
+        progress(final.iterations + round(share * final.iterations), 2 * final.iterations)
         yield [images.in_map_exposure(int(random.integers(len(images))))]

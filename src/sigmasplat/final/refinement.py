@@ -176,7 +176,7 @@ class Clock:
             return 0.0
         return (self.spent_s - self.begins_s) / max(self.ends_s - self.begins_s, 1e-9)
 
-    def done(self, step: int, steps: int) -> float:
+    def done(self, step: int, steps: float) -> float:
         """Return the share of the stage that is done before one of its steps, of its steps or of its time, 0 to 1."""
         return min(1.0, max(step / max(steps, 1), self.share))
 

@@ -108,7 +108,7 @@ class Slam(MainLoop, ArrayInterface):
         if not self.steps or not (len(self.store) or self.cuts or self.config.final.iterations):
             return
         final, photos = self.config.final, any(keyframe.photo for keyframe in self.mapper.keyframes)
-        steps = final.iterations + final.width_iterations * (photos and final.iterations > 0)
+        steps = final.iterations * (1 + photos)
         measures = self.config.uncertainty.probes > 0
         total = max(1, steps + measures * self.atlas.keyframe_poses.total)
         progress(0, total)

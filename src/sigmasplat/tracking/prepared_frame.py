@@ -114,9 +114,10 @@ class PreparedFrame:
         return replace(self, target=self.target.with_depth(depth_m), image=image)
 
     def photo(self, config: Config) -> Photo | None:
-        """Return the colour at the size of the final map's last stage; None if working images are as large."""
+        """Return the colour at the size of the final map's last stage; None if working images are as large, or no final
+        map is refined."""
         size = photo_size(self.whole.camera, config.input.width, config.input.crop_px, config.final.width)
-        return None if size is None else Photo.of(self.whole, *size)
+        return Photo.of(self.whole, *size) if size and config.final.iterations else None
 
 
 def view_of(camera: Camera, config: Config) -> View:

@@ -97,7 +97,7 @@ def full_width(config: Config, camera: Camera) -> int | None:
     """
     final, settings = config.final, config.input
     size = photo_size(camera, settings.width, settings.crop_px, final.width)
-    return min(final.width, camera.width) if size and final.iterations and final.width_iterations else None
+    return min(final.width, camera.width) if size and final.iterations else None
 
 
 def refined_fx(config: Config, camera: Camera) -> float | None:
