@@ -52,17 +52,20 @@ class SeedShape(NamedTuple):
     """Initial opacity, 0 to 1. With a higher value the map can be used for tracking sooner."""
     density: float
     """Share of the chosen pixels of a later keyframe that become splats; more of them only take more time."""
+    push_back: float = 1.005
+    """Factor on the depth of seeds: blending with closer splats makes rendered depth small (VarSplat's code)."""
 
 
 SEED_SHAPES = {
-    "neighbours": SeedShape("neighbours", 1.0, 1.0, 0.5, 1.0),
+    "neighbours": SeedShape("neighbours", 1.0, 1.0, 0.5, 1.0, push_back=1.0),
+    "neighbours-behind": SeedShape("neighbours", 1.0, 1.0, 0.5, 1.0),
     # searching the map for neighbours costs more than fitting a keyframe
     "pixel": SeedShape("pixel", 0.8, 1.0, 0.8, 0.35),
     # with the slower change of sizes, larger seeds blur submaps; the depth of a disc seen at an angle is right, and the
     # path a little better
     "disc": SeedShape("pixel", 0.65, 0.1, 0.8, 0.35),
 }
-"""The values that belong to each `seeding.shape`. The first is that of VarSplat and CG-SLAM, the others are ours."""
+"""The values that belong to each `seeding.shape`: of VarSplat and CG-SLAM, of VarSplat's code, and ours."""
 
 
 @dataclass(frozen=True)
@@ -75,20 +78,20 @@ class SeedConfig(Section, name="seeding"):
     first_gradient: Count = 15_000
     """Number of additional pixels of the first keyframe, drawn in proportion to the image gradient, that become
     splats."""
-    first_edges: bool = False  # sampling by gradient finds the same pixels
-    """Whether all pixels on and beside Canny edges of the first keyframe become splats too."""
     later_max: Count = 0
     """Maximum number of new splats per later keyframe; 0 = no limit."""
+    alpha_below: Share = 0.6
+    """Pixels of a later keyframe are seeded where the rendered alpha of the map is below this."""
     depth_error_factor: NotNegative = 40.0
-    """Pixels are seeded where the rendered surface is behind the measured one by this multiple of the median depth
-    error; 0 = off (CG-SLAM). They are seeded too where the rendered alpha of the map is below `alpha_below`."""
+    """Pixels are seeded too where the rendered surface is behind the measured one by this multiple of the median depth
+    error; 0 = off (CG-SLAM)."""
     depth_error_least_m: NotNegative = 0.1  # 40 × a median of 2 mm alone would treat sensor noise as a new surface
     """Minimum distance, in metres, between rendered and measured surface for seeding by `depth_error_factor`."""
     min_distance_m: NotNegative = 0.01
     """No seed is placed closer than this to an existing splat in view."""
-    shape: Literal["neighbours", "pixel", "disc"] = "disc"
+    shape: Literal["neighbours", "neighbours-behind", "pixel", "disc"] = "disc"
     """Shape and size of seeds: neighbours = spheres, as large as the root mean squared distance to the 3 nearest splats
-    (papers); pixel = fewer and more opaque spheres, 0.8 times as large as a pixel at that depth × the spacing of the
+    (papers); neighbours-behind = the same, 0.5 % farther than the reading (VarSplat's code); pixel = fewer and more opaque spheres, 0.8 times as large as a pixel at that depth × the spacing of the
     seeds; disc = the same 0.65 times as large, as discs on the surface that the depth image shows, wider where they are
     seen at an angle and a tenth as thick."""
     outliers: Literal["keep", "remove", "remove-later"] = "keep"
@@ -102,6 +105,13 @@ class SeedConfig(Section, name="seeding"):
     thickness = FromRow[float]("shape", SEED_SHAPES)
     opacity = FromRow[float]("shape", SEED_SHAPES)
     density = FromRow[float]("shape", SEED_SHAPES)
+    push_back = FromRow[float]("shape", SEED_SHAPES)
+
+    @property
+    def first_edges(self) -> bool:
+        """Whether all pixels on and beside Canny edges of the first keyframe become splats too (VarSplat). Sampling by
+        gradient alone finds nearly the same."""
+        return self.scale_from == "neighbours" and self.first_gradient > 0
 
     @property
     def outlier_neighbours(self) -> int:
@@ -112,16 +122,6 @@ class SeedConfig(Section, name="seeding"):
     def outlier_first(self) -> bool:
         """Whether outliers are also removed from the seeds of an empty map."""
         return self.outliers != "remove-later"
-
-    @property
-    def alpha_below(self) -> float:
-        """Pixels are seeded where the rendered alpha of the map is below this: with CG-SLAM's rule it is ½."""
-        return 0.6 if self.depth_error_factor else 0.5
-
-    @property
-    def push_back(self) -> float:
-        """Factor on the depth of seeds: blending with closer splats makes rendered depth small (VarSplat's code)."""
-        return 1.005 if self.depth_error_factor else 1.0
 
 
 class Adjustment(NamedTuple):

@@ -81,14 +81,22 @@ class RegistrationRow(NamedTuple):
     three channels, which weights colour three times as much (pixels)."""
     target: str = "recorded"
     """Which image of a keyframe is localised: the recorded one, or the one that its own submap renders (rendered)."""
+    weight_color: float = 0.95
+    """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
+    textured: bool = False
+    """Whether colour counts only at pixels with much more gradient than others near them (`fit.target.textured`)."""
+    plain_gate: bool = False
+    """Whether loops are gated by plain r(q) · r(d), without limits of weights and gate (VarSplat eq. 18)."""
 
 
 REGISTRATIONS = {
     "keyframe": RegistrationRow(0.001, 0.001, "pixels"),
     "few-steps": RegistrationRow(0.001, 0.001, "pixels"),
-    "paper": RegistrationRow(0.015, 0.005, "values"),
-    "paper-fine": RegistrationRow(0.003, 0.001, "values"),
-    "rendered": RegistrationRow(0.015, 0.005, "values", "rendered"),
+    "paper": RegistrationRow(0.015, 0.005, "values", weight_color=0.5, plain_gate=True),
+    "paper-fine": RegistrationRow(0.003, 0.001, "values", weight_color=0.5, plain_gate=True),
+    "code": RegistrationRow(0.015, 0.005, "values", textured=True),
+    "code-fine": RegistrationRow(0.003, 0.001, "values", textured=True),
+    "rendered": RegistrationRow(0.015, 0.005, "values", "rendered", textured=True),
 }
 """The values that belong to each `registration.method`: of the paper, its code, or ours."""
 
@@ -101,16 +109,15 @@ class RegistrationConfig(Section, name="registration"):
     """Number of keyframes of each submap that are localised in the other one."""
     iterations: Count = 0  # descent hardly ever finds what alignment does not, and takes half of a search
     """Maximum number of Adam steps per keyframe, after alignment; each step is a render. 0 = only alignment."""
-    method: Literal["keyframe", "few-steps", "paper", "paper-fine", "rendered"] = "keyframe"
+    method: Literal["keyframe", "few-steps", "paper", "paper-fine", "code", "code-fine", "rendered"] = "keyframe"
     """How a keyframe is localised in the other submap. keyframe: against the map, and finally against the recorded
     image of the nearest keyframe there (ours), because the surfaces of a young map are biased; a loop that only the
-    maps show is rejected. The others use the pose relative to the map (paper): few-steps = with small Adam steps;
-    paper, paper-fine = with those of VarSplat for real images and for Replica; rendered = as paper, with the image that
-    its own submap renders instead of the recorded one (VarSplat's code for ScanNet)."""
+    maps show is rejected. The others use the pose relative to the map: few-steps = with small Adam steps; paper,
+    paper-fine = by the loss and the gate of VarSplat's text (eq. 18, 19), with its steps for real images and for
+    Replica; code, code-fine = as VarSplat's code: λ_c 0.95, colour only at pixels with much gradient, a gate with
+    limits; rendered = as code, with the image that its own submap renders (VarSplat's code for ScanNet)."""
     exposure: ClassVar[bool] = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
-    weight_color: ClassVar[float] = 0.95
-    """λ_c, the weight of the colour loss in registration; the depth loss has 1 − λ_c."""
     uncertainty: bool = True
     """Whether pixels are weighted by the V of the other submap; off = LoopSplat."""
     tau: Above0 = 10.0
@@ -138,6 +145,9 @@ class RegistrationConfig(Section, name="registration"):
     lr_translation = FromRow[float]("method", REGISTRATIONS)
     color_mean = FromRow[str]("method", REGISTRATIONS)
     target = FromRow[str]("method", REGISTRATIONS)
+    weight_color = FromRow[float]("method", REGISTRATIONS)
+    textured = FromRow[bool]("method", REGISTRATIONS)
+    plain_gate = FromRow[bool]("method", REGISTRATIONS)
 
     @property
     def to_keyframe(self) -> bool:

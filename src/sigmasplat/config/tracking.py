@@ -69,9 +69,10 @@ class TrackingConfig(Section, name="tracking"):
     """Only pixels with a rendered alpha above this are used; 0 = off."""
     outlier_factor: NotNegative = 50.0
     """Only pixels with a depth error below this multiple of its median are used; 0 = off."""
-    reinit_factor: NotNegative = 5.0
-    """If the first loss exceeds this multiple of its running median, tracking restarts from odometry with twice the
-    iterations."""
+    restart: Literal["off", "longer", "odometry"] = "off"
+    """What `method` adam does where the loss at the first guess jumps: longer = twice the iterations, if it exceeds 5
+    times the median of the losses at which recent frames ended (VarSplat's code); odometry = the same from the motion
+    that aligning the last image gives, if it exceeds 50 times the median (VarSplat on ScanNet++)."""
     exposure: bool = False
     """Whether a factor and an offset of the colour are fitted with the pose, for cameras that change their exposure."""
     lr_exposure: ClassVar[float] = 0.01
@@ -83,12 +84,6 @@ class TrackingConfig(Section, name="tracking"):
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
     `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,
     instead of the law of `render.depth_noise_per_m`, also for loops and where a lost camera is searched for."""
-    lost_agreement: ClassVar[float] = 0.6
-    """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
-    surface; not used with `verify`."""
-    lost_share: ClassVar[float] = 0.2
-    """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap); with
-    `verify`, if reference and frame have less than this share of the reference's readings in common."""
     fit_depth: bool = False
     """Whether the depth of each frame is fitted to the map and to other views before it is used, because its scale is
     arbitrary. `run` sets it for depth that a network predicted."""
@@ -105,6 +100,19 @@ class TrackingConfig(Section, name="tracking"):
     average = FromRow[str]("descent", DESCENTS)
     amsgrad = FromRow[bool]("descent", DESCENTS)
     first_iterations = FromRow[int]("descent", DESCENTS)
+
+    @property
+    def lost_agreement(self) -> float:
+        """Tracking is lost if map and sensor agree in depth on less than this share of the pixels where both have a
+        surface; not used with `verify`. With `method` adam no frame is lost (papers)."""
+        return 0.0 if self.method == "adam" else 0.6
+
+    @property
+    def lost_share(self) -> float:
+        """Tracking is lost if the map agrees with less than this share of the sensor's readings (agreement × overlap);
+        with `verify`, if reference and frame have less than this share of the reference's readings in common. With
+        `method` adam no frame is lost (papers)."""
+        return 0.0 if self.method == "adam" else 0.2
 
     def without_motion(self) -> "TrackingConfig":
         """Return the settings for the second frame of a sequence, which has no motion model yet (CG-SLAM's code)."""

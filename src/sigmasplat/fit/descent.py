@@ -4,7 +4,7 @@ A pose has parameters that can be changed by addition; the gradient of a twist i
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,8 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class QuaternionMotion:
-    """(w, x, y, z, tx, ty, tz) of the motion relative to an initial guess; the quaternion may have any norm (VarSplat's
-    code). Like `AxisAngle`: `rotations` numbers for the rotation come first, those of the translation last."""
+    """(w, x, y, z, tx, ty, tz) of the motion relative to an initial guess; the quaternion may have any norm (VarSplat).
+    Like `AxisAngle`: `rotations` numbers for the rotation come first, those of the translation last."""
 
     guess: Matrix
     rotations = 4
@@ -117,7 +117,7 @@ def descend(
     for steps in range(1, iterations + 1):
         T = way.pose(numbers)
         view.forward(params, T)
-        loss, g_exposure = tracking_loss(view, target, config, torch.as_tensor(exposure).float())
+        loss, g_exposure = by_texture(tracking_loss, view, target, config, torch.as_tensor(exposure).float())
         first = loss if steps == 1 else first
         blind = loss == 0.0  # no common pixels: must not replace a pose that has some
         if loss < best and not (blind and steps > 1):
@@ -129,6 +129,20 @@ def descend(
             break
     a, b = best_exposure.tolist()
     return Descent(best_T, (a, b), first, best, steps)
+
+
+def by_texture(
+    tracking_loss: TrackingLoss, view: Any, target: Target, config: TrackingConfig, exposure: Tensor
+) -> tuple[float, Tensor]:
+    """Compute a tracking loss whose colour part, with the median of V, uses only the pixels of `target.textured`."""
+    if target.textured is None:
+        return tracking_loss(view, target, config, exposure)
+    share = config.weight_color
+    on_color, g_exposure = tracking_loss(view, target.textured, replace(config, weight_color=1.0), exposure)
+    g_color = view.g_sums.clone()
+    on_depth, _ = tracking_loss(view, target, replace(config, weight_color=0.0), exposure)
+    view.g_sums.mul_(1.0 - share).add_(g_color, alpha=share)
+    return share * on_color + (1.0 - share) * on_depth, share * g_exposure
 
 
 def exposure_rate(config: TrackingConfig) -> float:

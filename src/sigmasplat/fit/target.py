@@ -5,6 +5,7 @@ from dataclasses import dataclass, field as dataclass_field, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import correlate, minimum_filter
 from torch import Tensor
 
 from sigmasplat.data import se3
@@ -36,14 +37,35 @@ def luma(color: Tensor) -> Tensor:
     return gray
 
 
+BLOCKS, EDGE_FACTOR = 32, 4.0
+SCHARR = np.array([[3, 10, 3], [0, 0, 0], [-3, -10, -3]], np.float32) / 32
+NEARLY_BLACK = 0.01
+
+
+def textured(color: Image) -> NDArray[np.bool_]:
+    """Return the pixels [H, W] of colour [H, W, 3] whose gradient is above 4 times the median of their block, in a grid
+    of 32 × 32 blocks; not beside a pixel that is nearly black (VarSplat's code, registration)."""
+    gray = color.mean(-1)
+    lit = minimum_filter(gray, 3, mode="mirror") > NEARLY_BLACK
+    gradient = np.hypot(correlate(gray, SCHARR, mode="mirror"), correlate(gray, SCHARR.T, mode="mirror")) * lit
+    chosen = np.zeros(gray.shape, bool)
+    for rows in np.array_split(np.arange(gray.shape[0]), BLOCKS):
+        for columns in np.array_split(np.arange(gray.shape[1]), BLOCKS):
+            block = gradient[(at := np.ix_(rows, columns))]
+            chosen[at] = block > EDGE_FACTOR * np.median(block) if block.size else False
+    return chosen
+
+
 @dataclass(eq=False)
 class Target:
-    """What a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or padding)."""
+    """What a view should render: color [3, rows, columns], depth [rows, columns] m (0 = no reading or padding);
+    textured: the same with readings only where colour counts, None if it counts everywhere."""
 
     camera: Camera
     color: Tensor
     depth: Tensor
     valid_pixels: int
+    textured: "Target | None" = None
     _on_device: "Target | None" = dataclass_field(default=None, init=False, repr=False)
 
     def to(self, device: torch.device) -> "Target":
@@ -52,7 +74,8 @@ class Target:
             return self
         if self._on_device is None or self._on_device.depth.device != device:
             color, depth = self.color.to(device), self.depth.to(device)
-            self._on_device = Target(self.camera, color, depth, self.valid_pixels)
+            on_texture = None if self.textured is None else self.textured.to(device)
+            self._on_device = Target(self.camera, color, depth, self.valid_pixels, on_texture)
         return self._on_device
 
     @staticmethod
@@ -77,6 +100,11 @@ class Target:
         depth = torch.zeros_like(self.depth)
         depth[: self.camera.height, : self.camera.width] = torch.from_numpy(depth_m)
         return Target(self.camera, self.color, depth, int((depth_m > 0).sum()))
+
+    def only_textured(self) -> "Target":
+        """Return the same images, of which colour counts only where it has texture (`textured`)."""
+        chosen = textured(self.image.numpy())
+        return replace(self, textured=self.with_depth(self.depth_image.numpy() * chosen))
 
     def read_at_once(self, readout: Readout) -> "Target":
         """Return the images as the camera sees them at one time (`data.read_at_once`)."""

@@ -98,32 +98,40 @@ class SubmapPair:
     database_keyframes: tuple[int, ...]
 
 
-def variance_weights(log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0) -> Matrix:
+def variance_weights(
+    log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0, plain: bool = False
+) -> Matrix:
     """Return a weight per splat [N], high for a low colour variance (VarSplat §4, w_i).
 
-    w = clamp(exp(−(log σ̄² − median)/τ) / mean, 1/weight_max, weight_max). σ̄² is the mean over the channels of σ² =
-    exp(log_variances [N, 3]); "mean" is that of exp(·) over the submap's splats. A common factor in all σ² cancels.
+    w = clamp(exp(−(log σ̄² − median)/τ) / mean, 1/weight_max, weight_max), without clamp and mean if `plain`. σ̄² is the
+    mean over the channels of σ² = exp(log_variances [N, 3]); "mean" is that of exp(·) over the submap's splats. A common
+    factor in all σ² cancels.
     """
     log_mean = logsumexp(np.asarray(log_variances, np.float64), axis=1)
+    if plain:
+        return np.exp((np.median(log_mean) - log_mean) / tau) if len(log_mean) else log_mean
     # exp(·) / mean is N × softmax, in which the median and the ⅓ of the channel mean cancel and nothing overflows.
     return np.clip(len(log_mean) * softmax(-log_mean / tau), 1.0 / weight_max, weight_max)
 
 
 def opacity_ratio(
-    opacities: NDArray[np.floating], log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0
-) -> float:
+    opacities: NDArray[np.floating], log_variances: NDArray[np.floating], tau: float = 10.0, weight_max: float = 3.0,
+    plain: bool = False,
+) -> float:  # fmt: skip
     """Return r = Σ w o / Σ o of a submap's splats (VarSplat §4): above 1 if opaque splats have low variance.
 
-    opacities [N] in [0, 1], log_variances [N, 3]. r is 1 if all σ² are equal, or if no splat is opaque.
+    opacities [N] in [0, 1], log_variances [N, 3]; plain: as in `variance_weights`. r is 1 if all σ² are equal, or if no
+    splat is opaque.
     """
     opaque = np.asarray(opacities, np.float64)
     total = float(opaque.sum())
-    return float(variance_weights(log_variances, tau, weight_max) @ opaque) / total if total > 0.0 else 1.0
+    return float(variance_weights(log_variances, tau, weight_max, plain) @ opaque) / total if total > 0.0 else 1.0
 
 
-def gate(query_ratio: float, database_ratio: float | Matrix) -> Matrix:
-    """Return clamp(r(q) · r(d), 0.85, 1.20) of each database ratio [n] (VarSplat §4)."""
-    return np.asarray(np.clip(query_ratio * database_ratio, GATE_LEAST, GATE_MOST))
+def gate(query_ratio: float, database_ratio: float | Matrix, plain: bool = False) -> Matrix:
+    """Return r(q) · r(d) of each database ratio [n], clamped to 0.85 … 1.20 unless it is `plain` (VarSplat §4)."""
+    product = np.asarray(query_ratio * database_ratio)
+    return product if plain else product.clip(GATE_LEAST, GATE_MOST)
 
 
 def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Matrix:
@@ -142,6 +150,7 @@ def self_similarity(descriptors: Descriptors, min_similarity: float = 0.5) -> Ma
 def find_candidates(
     query: SubmapDescriptor, known: DescribedSubmaps, min_similarity: float = 0.5, min_interval: int = 2,
     similarity_floor: float = 0.0, uncertainty: bool = True, among: NDArray[np.bool_] | None = None,
+    plain: bool = False,
 ) -> list[Candidate]:  # fmt: skip
     """List the keyframe pairs of the query and other submaps that may show the same place (VarSplat §4), best first.
 
@@ -150,11 +159,11 @@ def find_candidates(
     low `self_similarity`). Without `uncertainty` the gate is 1. The order is by gated similarity, then by database
     submap, query keyframe, database keyframe; the order of `known` does not matter.
 
-    among [S]: which of the known submaps are compared; None: all.
+    among [S]: which of the known submaps are compared; None: all. plain: as in `gate`.
     """
     threshold = self_similarity(query.descriptors, min_similarity)
     wanted = _apart(query, known, min_interval) & (True if among is None else among)
-    gates = gate(query.opacity_ratio, known.opacity_ratio) if uncertainty else np.ones(len(known))
+    gates = gate(query.opacity_ratio, known.opacity_ratio, plain) if uncertainty else np.ones(len(known))
     found: list[Candidate] = []
     for row in np.flatnonzero(wanted).tolist() if len(threshold) else ():
         other, factor = known[row], gates[row]

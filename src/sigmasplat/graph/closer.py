@@ -161,7 +161,8 @@ class LoopCloser:
 
     def _described(self, submap: Submap, descriptors: Sequence[NDArray[np.float32]]) -> SubmapDescriptor:
         c, log_variances = self.config.loops, submap.field.params[:, COLUMNS["log_variances"]].numpy()
-        ratio = opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max)
+        plain = self.config.registration.plain_gate
+        ratio = opacity_ratio(submap.field.opacities.numpy(), log_variances, c.tau, c.weight_max, plain)
         return SubmapDescriptor(submap.index, np.stack(descriptors), ratio)
 
     def closing(
@@ -206,9 +207,9 @@ class LoopCloser:
         c = self.config.loops
         database, components = self.descriptors, np.array(atlas.components, np.int64)
         connected = components[database.numbers] == components[query.index]
-        keyframes = self.config.registration.keyframes
+        keyframes, plain = self.config.registration.keyframes, self.config.registration.plain_gate
         candidates = find_candidates(
-            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, connected
+            query, database, c.min_similarity, c.min_interval, c.similarity_floor, c.uncertainty, connected, plain
         )
         pairs = pairs_to_register(candidates, query, database, keyframes)
         if c.near_m:

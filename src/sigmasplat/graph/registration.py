@@ -94,6 +94,7 @@ class Registrar:
         if max(map(score, fits)) < DOUBTFUL:
             by_features = yield from self.guesses_by_features(own, keyframe, other, alike)
             fits += yield from self._all_aligned(other_rows, live, by_features)
+        target = target.only_textured() if self.config.textured else target
         fit, at_keyframe = yield from self._refined(other, other_rows, target, live, max(fits, key=score))
         A = se3.adjoint(T_own_camera)
         covariance, comparison = self._checked(other_rows, live, fit.T_camera_world)

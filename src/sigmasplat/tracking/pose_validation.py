@@ -24,6 +24,8 @@ costs itself. Above the second it is doubtful, and tried again from other guesse
 pose counts without a path that leads to it: a wrong loop bends the whole map."""
 DOUBT = 0.7
 """Without a comparison, a pose is doubtful if its agreement × overlap falls below this share of the usual value."""
+RESTARTS = {"longer": 5.0, "odometry": 50.0}
+"""The multiple of the usual loss above which a descent starts again, by `tracking.restart` (VarSplat's code)."""
 FEW_MATCHES = 15
 """A pose from fewer matches, without a known path, must be three times as sure: a dozen features of one wall also match
 another wall, and walls are alike."""
@@ -95,9 +97,10 @@ def is_lost(fit: PoseFit, least_agreement: float, least_share: float) -> bool:
     return fit.agreement < least_agreement or fit.agreement * fit.overlap < least_share
 
 
-def jumped(value: float, history: Sequence[float], factor: float) -> bool:
-    """Return whether a loss exceeds `factor` times the median of the recent losses (VarSplat §3, re-initialisation)."""
-    return len(history) >= 5 and value > factor * float(np.median(history[-50:]))
+def jumped(first_loss: float, last_losses: Sequence[float], restart: str) -> bool:
+    """Return whether the first loss of a frame is so far above the last losses of recent frames that its descent starts
+    again (VarSplat §3, re-initialisation)."""
+    return restart in RESTARTS and bool(last_losses) and first_loss > RESTARTS[restart] * median(last_losses)
 
 
 @dataclass(eq=False)

@@ -51,7 +51,7 @@ class Tracker:
     detector: DynamicDetector = dataclass_field(default_factory=DynamicDetector)
     depth: DepthFit = NOTHING_FITTED
     agreements: list[float] = dataclass_field(default_factory=list)
-    first_losses: list[float] = dataclass_field(default_factory=list)
+    losses: list[float] = dataclass_field(default_factory=list)
     statistics: TrackingStatistics = dataclass_field(default_factory=TrackingStatistics)
     prior: PosePrior = NO_PRIOR
     lost: bool = False
@@ -102,6 +102,8 @@ class Tracker:
     def _estimated(self, given: Given, seen: PreparedFrame, shown: PreparedFrame) -> PoseFit:
         """Return the best of the fits from all guesses; shown: the frame as it is fitted first."""
         best, before = self._fit(given, shown, given.prediction.predicted), self.statistics.noise
+        if self.config.method == "adam":
+            return self._restarted(given, shown, best)
         if self.statistics.learns_noise(best.comparison):
             seen.live = seen.live.noisier(self.statistics.noise / before)
             shown = seen.shown
@@ -181,7 +183,7 @@ class Tracker:
         self.motion = motion.stopped() if self.lost else motion
         if not self.lost:
             self.agreements = [*self.agreements, fit.agreement * fit.overlap][-judge.RECENT :]
-            self.first_losses = [*self.first_losses, fit.first_loss][-judge.RECENT :]
+            self.losses = [*self.losses, fit.loss][-judge.RECENT :]
             if fit.comparison is not None:
                 self.statistics.add(fit.comparison)
         self.previous = T_world_camera
@@ -216,12 +218,23 @@ class Tracker:
         if prediction.measured:
             yield self.previous @ self.motion.velocity
 
+    def _restarted(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
+        """Descend again with twice the iterations if the first loss jumped (VarSplat §3); return the only or the second
+        fit, as the papers do."""
+        if not judge.jumped(fit.first_loss, self.losses, self.config.restart) or given.should_stop():
+            return fit
+        start = self._by_odometry(given, seen) if self.config.restart == "odometry" else None
+        return self._fit(given, seen, given.prediction.predicted if start is None else start, patience=2)
+
+    def _by_odometry(self, given: Given, seen: PreparedFrame) -> Matrix | None:
+        """Return T_world_camera by aligning the last image to this one; None if that fails."""
+        moved = odometry(self.last_image, seen.live, given, self.config)
+        return None if moved is None else np.asarray(self.previous @ se3.inverse(moved))
+
     def _retry(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
-        """Retry from odometry with twice the iterations (VarSplat §3), and from the last pose; return the best fit."""
-        moved = None if given.should_stop() else odometry(self.last_image, seen.live, given, self.config)
-        starts = [given.prediction.last]
-        if moved is not None:
-            starts.insert(0, np.asarray(self.previous @ se3.inverse(moved)))
+        """Retry from odometry and from the last pose (ours); return the best fit."""
+        found = None if given.should_stop() else self._by_odometry(given, seen)
+        starts = [start for start in (found, given.prediction.last) if start is not None]
         fits = [fit, *(self._fit(given, seen, start, 2) for start in unless(given.should_stop, starts))]
         best = max(fits, key=self._score)
         if self._is_lost(best):
@@ -243,8 +256,8 @@ class Tracker:
     def _doubts(self, fit: PoseFit) -> bool:
         if fit.comparison is not None:
             return judge.p_wrong(fit.comparison) > judge.DOUBTFUL
-        worse = fit.agreement * fit.overlap < judge.DOUBT * float(np.median(self.agreements or [1.0]))
-        return worse or judge.jumped(fit.first_loss, self.first_losses, self.config.reinit_factor)
+        usual = float(np.median(self.agreements or [1.0]))
+        return fit.alignment is not None and fit.agreement * fit.overlap < judge.DOUBT * usual
 
     # ---- keyframes ----
 

@@ -105,9 +105,9 @@ STATE = np.dtype(
 def descend_on_device(
     params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> Descent:
-    """Minimise the tracking loss as `descend` does; AMSGrad runs on the host. Raises BackendError if there are too many
-    pairs of splats and tiles."""
-    if config.amsgrad:
+    """Minimise the tracking loss as `descend` does; AMSGrad, and colour at textured pixels alone, run on the host.
+    Raises BackendError if there are too many pairs of splats and tiles."""
+    if config.amsgrad or target.textured is not None:
         return descend(params, view, target, T_camera_world, config, iterations)
     if view.raster.capacity is None:
         view.forward(params, T_camera_world)  # measures how many pairs to expect
