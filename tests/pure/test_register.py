@@ -38,7 +38,7 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 SEEDS = SeedConfig(scale_from="pixel", density=1.0, scale_factor=0.8)
 CONFIG = paper_settings(
     tracking=TrackingConfig(method="align", align_weight_color=0.1),
-    registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0),
+    registration=RegistrationConfig(iterations=10, lr_translation=1e-3, lr_rotation=1e-3, tau=10.0, judges=True),
 )
 TO_KEYFRAME = replace(CONFIG, registration=changed(CONFIG.registration, to_keyframe=True))
 

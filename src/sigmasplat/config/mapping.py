@@ -91,9 +91,10 @@ class SeedConfig(Section, name="seeding"):
     """No seed is placed closer than this to an existing splat in view."""
     shape: Literal["neighbours", "neighbours-behind", "pixel", "disc"] = "disc"
     """Shape and size of seeds: neighbours = spheres, as large as the root mean squared distance to the 3 nearest splats
-    (papers); neighbours-behind = the same, 0.5 % farther than the reading (VarSplat's code); pixel = fewer and more opaque spheres, 0.8 times as large as a pixel at that depth × the spacing of the
-    seeds; disc = the same 0.65 times as large, as discs on the surface that the depth image shows, wider where they are
-    seen at an angle and a tenth as thick."""
+    (papers); neighbours-behind = the same, 0.5 % farther than the reading (VarSplat's code); pixel = fewer and more
+    opaque spheres, 0.8 times as large as a pixel at that depth × the spacing of the seeds; disc = the same 0.65 times
+    as large, as discs on the surface that the depth image shows, wider where they are seen at an angle and a tenth as
+    thick."""
     outliers: Literal["keep", "remove", "remove-later"] = "keep"
     """Whether seeds far from their 40 nearest neighbours are removed; remove-later = not from the seeds of an empty map
     (VarSplat's code)."""

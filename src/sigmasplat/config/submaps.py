@@ -87,11 +87,13 @@ class RegistrationRow(NamedTuple):
     """Whether colour counts only at pixels with much more gradient than others near them (`fit.target.textured`)."""
     plain_gate: bool = False
     """Whether loops are gated by plain r(q) · r(d), without limits of weights and gate (VarSplat eq. 18)."""
+    judges: bool = False
+    """Whether localisations must agree with the sensor and with each other (ours); off = all are combined (papers)."""
 
 
 REGISTRATIONS = {
-    "keyframe": RegistrationRow(0.001, 0.001, "pixels"),
-    "few-steps": RegistrationRow(0.001, 0.001, "pixels"),
+    "keyframe": RegistrationRow(0.001, 0.001, "pixels", judges=True),
+    "few-steps": RegistrationRow(0.001, 0.001, "pixels", judges=True),
     "paper": RegistrationRow(0.015, 0.005, "values", weight_color=0.5, plain_gate=True),
     "paper-fine": RegistrationRow(0.003, 0.001, "values", weight_color=0.5, plain_gate=True),
     "code": RegistrationRow(0.015, 0.005, "values", textured=True),
@@ -148,6 +150,7 @@ class RegistrationConfig(Section, name="registration"):
     weight_color = FromRow[float]("method", REGISTRATIONS)
     textured = FromRow[bool]("method", REGISTRATIONS)
     plain_gate = FromRow[bool]("method", REGISTRATIONS)
+    judges = FromRow[bool]("method", REGISTRATIONS)
 
     @property
     def to_keyframe(self) -> bool:

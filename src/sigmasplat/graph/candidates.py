@@ -104,8 +104,8 @@ def variance_weights(
     """Return a weight per splat [N], high for a low colour variance (VarSplat §4, w_i).
 
     w = clamp(exp(−(log σ̄² − median)/τ) / mean, 1/weight_max, weight_max), without clamp and mean if `plain`. σ̄² is the
-    mean over the channels of σ² = exp(log_variances [N, 3]); "mean" is that of exp(·) over the submap's splats. A common
-    factor in all σ² cancels.
+    mean over the channels of σ² = exp(log_variances [N, 3]); "mean" is that of exp(·) over the submap's splats. A
+    common factor in all σ² cancels.
     """
     log_mean = logsumexp(np.asarray(log_variances, np.float64), axis=1)
     if plain:

@@ -145,10 +145,11 @@ class Registrar:
         yield
         if at_keyframe is not None:
             return at_keyframe, True
-        steps, hopeless = self.config.iterations, score(found) <= HOPELESS * self.config.share_least
-        if found.alignment is not None and (hopeless or not steps):
+        c = self.config
+        hopeless = c.judges and score(found) <= HOPELESS * c.share_least
+        if found.alignment is not None and (hopeless or not c.iterations):
             return found, False
-        found = fit_pose_adam(other_rows, self.view, target, found.T_camera_world, self.tracking, steps)
+        found = fit_pose_adam(other_rows, self.view, target, found.T_camera_world, self.tracking, c.iterations)
         yield from long_slice()
         at_keyframe = self._at_keyframe(other, target, live, found)
         return at_keyframe or found, at_keyframe is not None
@@ -222,13 +223,13 @@ class Registrar:
         self, a: Submap, b: Submap, found: Sequence[Localisation], centre_b: Matrix, T_a_b: Matrix
     ) -> Registration:
         c, scale = self.config, self.view.options.scene_scale
-        good = [f for f in found if f.agreement >= c.agreement_least and f.agreement * f.overlap >= c.share_least]
+        good = [f for f in found if not c.judges or (f.agreement >= c.agreement_least and score(f) >= c.share_least)]
         good = [f for f in good if f.comparison is None or confirmed(f.comparison)]
         if len(good) < 2:
             best = max(f.agreement * f.overlap for f in found)
             why = f"{len(good)} of {len(found)} keyframes were localised (the best explains {best:.0%})"
             return refused(T_a_b, found, len(good), why)
-        agreed = consensus(good, centre_b, c.spread_m * scale, np.deg2rad(c.spread_deg))
+        agreed = consensus(good, centre_b, c.spread_m * scale, np.deg2rad(c.spread_deg)) if c.judges else good
         if len(agreed) < 2:
             return refused(T_a_b, good, len(agreed), f"the poses of {len(good)} keyframes disagree")
         if c.to_keyframe and not any(f.at_keyframe for f in agreed):
@@ -287,7 +288,7 @@ def tracking_of(config: Config) -> TrackingConfig:
     return LocalisationConfig(**vars(same))
 
 
-def score(fit: PoseFit) -> float:
+def score(fit: PoseFit | Localisation) -> float:
     """Return the share of a keyframe that its pose explains, in [0, 1]: agreement × overlap."""
     return fit.agreement * fit.overlap
 

@@ -2,12 +2,8 @@
 
 `cgslam-*` follow the paper (ECCV 2024, arXiv 2403.16095), `cgslam-light-*` are its half-resolution variant.
 `cgslam-loops-*` add the submaps, loops and final map of VarSplat to the paper's settings. `cgslam-fast` and
-`cgslam-loops-fast` are ours, sized for two CPU cores.
-
-From the paper: loss weights, iterations, intervals, window, learning rates of poses, ψ and τ. From the code, where the
-paper gives no values: α_min, near plane, crops, masks, learning rates of splats, and when splats are split or removed.
-Ours: `primitives.faded_opacity`, and the steps at which uncertain splats fade and are removed.
-The values are in `values/cgslam.toml`.
+`cgslam-loops-fast` are ours, sized for two CPU cores. The values are in `values/cgslam.toml`; where each one comes from:
+docs/paper-values.md.
 """
 
 import dataclasses

@@ -1,9 +1,9 @@
-"""Presets with the values of the papers' released code, by scene: rows of the tables in `scenes/`, and the code's
-methods where the paper differs. Mistakes of the code are not reproduced, such as another camera's calibration for fr3.
+"""Presets with the values and methods of the papers' released code, by scene: rows of the tables in `scenes/`. Mistakes
+of the code are not reproduced, such as another camera's calibration for fr3; deviations: docs/varsplat.md.
 
 VarSplat: the colours of all splats are frozen in the first half of a keyframe's steps: pruning makes them trainable
 again. Adam starts anew at each keyframe, the pose's Adam is AMSGrad, and tau of registration is 3 in all scenes (the
-arguments are given by position, so w_max is used as tau). Deviations: docs/varsplat.md.
+arguments are given by position, so w_max is used as tau).
 
 CG-SLAM: bundle adjustment moves only the newest pose, with a gradient without the path through the covariance. The
 window is chosen by the similarity of NetVLAD; without a file of weights (`loops.weights`) the built-in descriptor is
@@ -24,10 +24,8 @@ CODE = read_values("values/released_code")
 def _varsplat(row: dict[str, Any]) -> Config:
     """Return the settings of a scene of VarSplat's code."""
     like: str = row["like"]
-    base = varsplat.DATASETS[like]
-    return base.changed(**CODE["varsplat"]).changed(**CODE[f"varsplat-{like}"]).changed(
+    return varsplat.DATASETS[like].changed(**CODE["varsplat"]).changed(**CODE[f"varsplat-{like}"]).changed(
         input={"crop_px": row["crop_px"]},
-        seeding={"outliers": "remove-later" if base.seeding.outliers == "remove" else "keep"},
         mapping={"weight_nll_depth": 1e-4 if row["nll_depth"] else 0.0},
         tracking={"tau": row["tau_tracking"]}, loops={"tau": row["tau_loops"]},
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Read ScanNet scenes extracted from .sens files by SensReader/python, and ScanNet++ scenes.
+"""Read ScanNet scenes extracted from .sens files by SensReader/python, preprocessed ones, and ScanNet++ scenes.
 
 color/0.jpg  depth/0.png  pose/0.txt                         also 000000.jpg
 intrinsic/intrinsic_color.txt  intrinsic_depth.txt  extrinsic_color.txt  extrinsic_depth.txt
@@ -7,6 +7,12 @@ intrinsics_color.txt  intrinsics_depth.txt                   or in the scene's f
 Depth (640×480, mm) has its own camera. It is registered to colour (1296×968), and the working width is depth's.
 Extrinsics transform a common frame to each camera: T_color_depth = E_color · E_depth⁻¹ (as in BundleFusion).
 Poses are camera to world, and −inf where tracking was lost: these frames are kept, without ground truth.
+
+Preprocessed scenes, as the code of LoopSplat and VarSplat reads them, have colour at the size of depth:
+
+rgb/frame_00000.png  depth/frame_00000.TIFF     640×480; depth as floats in metres, or whole millimetres
+gt_pose.txt                                     TUM's lines, one per frame; the times in them are not used
+intrinsic.txt                                   optional: the depth camera's matrix; else that of the code's settings
 
 ScanNet++ has undistorted DSLR photographs, and depth rendered from the laser scan:
 
@@ -47,11 +53,13 @@ from sigmasplat.api import (
     index_by_number,
     list_images,
     numbered_pairs,
+    published,
     read_frames,
     read_json_object,
     read_matrix,
     read_pose,
     read_pose_files,
+    read_poses,
     read_transforms_camera,
     se3,
 )
@@ -80,6 +88,27 @@ def _files(folder: Path) -> FrameFiles:
         "depth": index_by_number(list_images(folder / "depth", DEPTH_ENDINGS)),
         "pose": index_by_number(list_images(folder / "pose", (".txt",))),
     }
+
+
+PREPROCESSED = published("ScanNet's depth camera", Camera(*DEPTH_SIZE, 577.590698, 578.729797, 318.905426, 242.683609),
+                         MM_PER_METRE)  # fmt: skip
+
+
+def open_preprocessed(path: str, settings: InputConfig) -> RecordedSource:
+    """Open a preprocessed scene's folder. Raises SourceError if images, camera or poses cannot be used."""
+    folder = Path(path)
+    colors, depths = (index_by_number(list_images(folder / kind, DEPTH_ENDINGS)) for kind in ("rgb", "depth"))
+    images, skipped = numbered_pairs(folder, colors, depths, "rgb/*.png", "depth/*.TIFF")
+    T_world_camera = read_poses(folder / "gt_pose.txt").T_world_camera
+    last, count = max(images), len(T_world_camera)
+    if last >= count:
+        raise SourceError(
+            f"{folder / 'gt_pose.txt'}: {count} poses, but the last image has number {last}; is the file truncated?"
+        )
+    truth = build_trajectory((pair.timestamp_s, T_world_camera[n]) for n, pair in images.items())
+    K, size = folder / "intrinsic.txt", first_size([pair.color for pair in images.values()])
+    known = Calibration(_camera(K, read_matrix(K), size, DEPTH_SIZE), MM_PER_METRE) if K.is_file() else PREPROCESSED
+    return folder_source(folder, settings, [*images.values()], known, MM_PER_METRE, truth, skipped)
 
 
 def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
@@ -167,6 +196,11 @@ def _dslr(scene: Path) -> Path:
 PLUGIN = (
     SourceFormat("ScanNet", "color/, depth/ and pose/", _recognises, open_scannet, sensor="kinect-v1"),
     SourceFormat(
+        "ScanNet, preprocessed", "rgb/, depth/*.TIFF and gt_pose.txt",
+        lambda path: (Path(path) / "gt_pose.txt").is_file() and (Path(path) / "rgb").is_dir(),
+        open_preprocessed, sensor="kinect-v1",
+    ),
+    SourceFormat(
         "ScanNet++", "dslr/nerfstudio/", lambda path: (_dslr(Path(path)) / TRANSFORMS).is_file(), open_scannetpp
     ),
-)
+)  # fmt: skip
