@@ -149,6 +149,19 @@ def opengl(T: np.ndarray) -> list[list[float]]:
     return (T @ np.diag([1.0, -1.0, -1.0, 1.0])).tolist()
 
 
+def scannet_preprocessed(place: Path, s: Sample) -> Path:
+    """As LoopSplat's script writes it: floats in metres, a pose per frame, times of the day when it ran."""
+    folder = place / "scene0000_00"
+    text = "# timestamp tx ty tz qx qy qz qw\n"
+    for n, (color, depth_mm, T) in enumerate(zip(s.color, s.depth_mm, s.T_world_camera, strict=True)):
+        save(folder / f"rgb/frame_{n:05d}.png", color)
+        save(folder / f"depth/frame_{n:05d}.TIFF", depth_mm.astype(np.float32) / 1000)
+        text += tum_line(f"{1700000000 + n / 20:.4f}", T)
+    save_text(folder / "gt_pose.txt", text)
+    save_text(folder / "intrinsic.txt", rows(intrinsic(SMALL_CAMERA)))
+    return folder
+
+
 def scannetpp(place: Path, s: Sample) -> Path:
     """Frame 3 is a test view; the training photographs are not listed in order."""
     dslr = place / "0a5c013435" / "dslr"
@@ -267,6 +280,7 @@ LAYOUTS = {
     "scannet": Layout(
         "ScanNet", scannet, SMALL_CAMERA, times_s=[n * 7 / 30 for n in range(FRAMES)], exact=False, posed=[0, 1, 3]
     ),
+    "scannet_preprocessed": Layout("preprocessed ScanNet", scannet_preprocessed, SMALL_CAMERA),
     "scannetpp": Layout("ScanNet++", scannetpp, SMALL_CAMERA, exact=False, train=[0, 1, 2], posed=[0, 1, 2]),
     "seven_scenes": Layout("7-Scenes", seven_scenes, Camera(640, 480, 585.0, 585.0, 320.0, 240.0), VGA),
     "icl_nuim": Layout(

@@ -69,6 +69,21 @@ def test_variance_weights_equal_the_formula_written_out() -> None:
     assert found.min() == 1 / 3 and found.max() == 3.0, "the bounds must have been at work"
 
 
+def test_the_texts_weights_and_gate_have_no_limits_and_no_mean() -> None:
+    """VarSplat eq. 18: w = exp(−(log σ̄² − median)/τ), and the similarity times r(q) · r(d)."""
+    log_variances = np.random.default_rng(3).normal(-7.0, 3.0, (401, 3))
+    log_mean = np.log(np.exp(log_variances).mean(1))
+    expected = np.exp(-(log_mean - np.median(log_mean)) / 2.0)
+    np.testing.assert_allclose(variance_weights(log_variances, 2.0, plain=True), expected, rtol=1e-12)
+    assert expected.max() > 3.0 and expected.min() < 1 / 3.0
+    opacities = np.random.default_rng(4).uniform(0.1, 1.0, 401)
+    ratio = opacity_ratio(opacities, log_variances, 2.0, plain=True)
+    assert ratio == pytest.approx((expected * opacities).sum() / opacities.sum())
+    assert gate(0.5, 0.5, plain=True) == 0.25 and gate(3.0, np.array([2.0]), plain=True).tolist() == [6.0]
+    steady = [SubmapDescriptor(4, at(-25, 85), opacity_ratio=0.5)]
+    assert find_candidates(QUERY, steady) and not find_candidates(QUERY, steady, plain=True)
+
+
 def test_opacity_ratio_equals_the_formula_and_knows_steady_from_restless() -> None:
     opacities, log_variances = splats()
     w = variance_weights(log_variances)

@@ -65,12 +65,13 @@ def test_a_pose_is_lost_by_disagreement_or_by_too_little_in_common() -> None:
     assert {case: is_lost(fit(*case), 0.6, 0.2) for case in lost} == lost
 
 
-def test_a_loss_jumps_against_the_median_of_its_recent_past() -> None:
-    assert jumped(5.1, [1.0] * 5, 5.0) and not jumped(4.9, [1.0] * 5, 5.0)
-    assert not jumped(1e9, [1.0] * 4, 5.0), "four values are no habit yet"
-    assert jumped(5.1, [1.0, 1.0, 1.0, 900.0, 900.0], 5.0), "outliers do not move the median"
-    assert jumped(5.1, [100.0] * 60 + [1.0] * 50, 5.0), "only the last fifty count"
-    assert not jumped(NAN, [NAN] * 9, 5.0), "aligning has no first loss: the rule is silent"
+def test_a_first_loss_jumps_against_the_median_of_last_losses() -> None:
+    assert jumped(5.1, [1.0], "longer") and not jumped(4.9, [1.0], "longer")
+    assert jumped(50.1, [1.0], "odometry") and not jumped(49.9, [1.0], "odometry")
+    assert jumped(5.1, [1.0, 1.0, 1.0, 900.0, 900.0], "longer"), "outliers do not move the median"
+    assert not jumped(1e9, [], "longer"), "the first frame has nothing to be compared with"
+    assert not jumped(1e9, [1.0] * 9, "off")
+    assert not jumped(NAN, [1.0] * 9, "longer"), "aligning has no first loss: the rule is silent"
 
 
 def shares(keyframes: int, newest_probability: float, draws: int = 20_000) -> dict[int, float]:

@@ -11,6 +11,7 @@ from documents import ROOT
 from layouts import FRAMES, LAYOUTS, SMALL_CAMERA, sample
 from paper_settings import InputConfig
 from sigmasplat.data.camera import Camera
+from sigmasplat.errors import SourceError
 from sigmasplat.input.opening import format_of, formats
 from sigmasplat.plugins.checks.recording import inspect_source
 from sigmasplat.plugins.sources import open_source
@@ -118,6 +119,22 @@ def test_a_scene_without_poses_has_no_ground_truth(tmp_path):
         path.write_text(layouts.rows(np.full((4, 4), -np.inf)))
     source = open_source(folder)
     assert source.truth() is None and len(source) == FRAMES
+
+
+def test_a_preprocessed_scene_without_a_matrix_has_the_published_depth_camera(tmp_path):
+    scene = layouts.scannet_preprocessed(tmp_path, sample(layouts.VGA))
+    (scene / "intrinsic.txt").unlink()
+    source = open_source(scene)
+    assert source.camera == Camera(640, 480, 577.590698, 578.729797, 318.905426, 242.683609)
+    assert source.sensor == "kinect-v1" and source.origins["camera"].origin == "assumed"
+
+
+def test_poses_of_a_preprocessed_scene_that_are_cut_off_are_refused(tmp_path):
+    scene = layouts.scannet_preprocessed(tmp_path, sample())
+    path = scene / "gt_pose.txt"
+    path.write_text("\n".join(path.read_text().splitlines()[:-1]))
+    with pytest.raises(SourceError, match=r"gt_pose.txt: 3 poses, but the last image has number 3; is the file trunc"):
+        open_source(scene)
 
 
 # ScanNet++

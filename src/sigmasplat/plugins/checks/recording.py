@@ -236,7 +236,7 @@ def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> l
 
 
 def _suggested(format_name: str) -> str:
-    data_set = format_name.lower().replace("++", "pp")
+    data_set = format_name.lower().split()[-1].replace("++", "pp")
     papers = [name for name in list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
     return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
 

@@ -2,7 +2,7 @@
 
 `cgslam-*` follow the paper (ECCV 2024, arXiv 2403.16095), `cgslam-light-*` are its half-resolution variant.
 `cgslam-loops-*` add the submaps, loops and final map of VarSplat to the paper's settings. `cgslam-fast` and
-`cgslam-loops-fast` are ours, sized for two CPU cores. The values are in `values/cgslam.toml`; where each one comes from:
+`cgslam-loops-fast` are ours, sized for two CPU cores. The values are in `values/cgslam.toml`; where each comes from:
 docs/paper-values.md.
 """
 

@@ -196,7 +196,7 @@ def _dslr(scene: Path) -> Path:
 PLUGIN = (
     SourceFormat("ScanNet", "color/, depth/ and pose/", _recognises, open_scannet, sensor="kinect-v1"),
     SourceFormat(
-        "ScanNet, preprocessed", "rgb/, depth/*.TIFF and gt_pose.txt",
+        "preprocessed ScanNet", "rgb/, depth/*.TIFF and gt_pose.txt",
         lambda path: (Path(path) / "gt_pose.txt").is_file() and (Path(path) / "rgb").is_dir(),
         open_preprocessed, sensor="kinect-v1",
     ),
