@@ -56,7 +56,7 @@ def row(family: str, setting: str) -> str:
     groups = [f"{value}: {', '.join(in_short(family, names))}" for value, names in values.items()]
     cell = "; ".join(groups) if len(groups) > 1 else next(iter(values))
     source = re.sub(r"[\w*.-]+/[\w*./-]+|\w+\.py", r"`\g<0>`", SOURCES[family][setting])
-    return f"| `{setting}` | {family} | {cell} | {source} |"
+    return f"|`{setting}`|{family}|{cell}|{source}|"
 
 
 def scenes_of(paper: str) -> dict[str, Any]:

@@ -80,8 +80,10 @@ def test_the_texts_weights_and_gate_have_no_limits_and_no_mean() -> None:
     ratio = opacity_ratio(opacities, log_variances, 2.0, plain=True)
     assert ratio == pytest.approx((expected * opacities).sum() / opacities.sum())
     assert gate(0.5, 0.5, plain=True) == 0.25 and gate(3.0, np.array([2.0]), plain=True).tolist() == [6.0]
-    steady = [SubmapDescriptor(4, at(-25, 85), opacity_ratio=0.5)]
-    assert find_candidates(QUERY, steady) and not find_candidates(QUERY, steady, plain=True)
+    steady = [SubmapDescriptor(4, at(-25, 85), opacity_ratio=2.0)]
+    for plain, factor in ((False, 1.2), (True, 2.0)):
+        found = find_candidates(QUERY, steady, plain=plain)
+        assert found and [c.gated for c in found] == pytest.approx([factor * c.similarity for c in found])
 
 
 def test_opacity_ratio_equals_the_formula_and_knows_steady_from_restless() -> None:
