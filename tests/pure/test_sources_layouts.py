@@ -58,7 +58,8 @@ def test_the_parent_folder_lists_the_sequences_in_it(layout, tmp_path):
 def test_the_users_camera_overrides_every_format(layout, tmp_path):
     folder = layout.write(tmp_path, sample(layout.size))
     known = open_source(folder, **layout.options)
-    halved = open_source(folder, depth_scale=2 * known.depth_units_per_metre, fx=2 * known.camera.fx, **layout.options)
+    units = known.depth_units_per_metre  # None for floats, which are metres
+    halved = open_source(folder, depth_scale=2 * (units or 1.0), fx=2 * known.camera.fx, **layout.options)
     assert np.allclose(halved.frame(0).depth_m, known.frame(0).depth_m / 2, atol=1e-6)
     assert halved.camera.fx == 2 * known.camera.fx or halved.depth_registered
     fields = vars(layout.camera) | {"fx": 77.0, "fy": 78.0, "depth_scale": 250.0}
@@ -68,7 +69,8 @@ def test_the_users_camera_overrides_every_format(layout, tmp_path):
     (folder / "calibration.json").write_text(json.dumps(fields))
     own = open_source(folder, **layout.options)
     scale = 2 if known.depth_registered else 1
-    assert (own.camera.fx * scale, own.camera.fy * scale) == (77.0, 78.0) and own.depth_units_per_metre == 250.0
+    assert (own.camera.fx * scale, own.camera.fy * scale) == (77.0, 78.0)
+    assert own.depth_units_per_metre == (250.0 if units else None)
 
 
 def test_the_documents_list_every_format():
