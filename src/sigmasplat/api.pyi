@@ -135,6 +135,7 @@ from sigmasplat.fit.mapping_step import (
 )
 from sigmasplat.fit.target import Target as Target, luma as luma
 from sigmasplat.fit.tracking_loss import reference_maps as reference_maps, tracking_params as tracking_params
+from sigmasplat.graph.closer import NETVLAD as NETVLAD, lacks_netvlad as lacks_netvlad
 from sigmasplat.graph.loops import Loop as Loop
 from sigmasplat.graph.path_covariance import PathCovariance as PathCovariance
 from sigmasplat.input.calibration import (

@@ -6,7 +6,9 @@ from typing import Any
 import pytest
 
 from command_line import exit_code
+from sigmasplat.config.find_preset import preset
 from sigmasplat.errors import ConfigError, SourceError
+from sigmasplat.plugins.batch.batch import Batch
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.batch.scores import OURS, PAPER, Written, rows
@@ -15,7 +17,7 @@ from sigmasplat.plugins.presets.table_files import list_tables
 
 WANTED = {
     "varsplat-replica", "varsplat-tum", "varsplat-scannet", "varsplat-scannetpp", "varsplat-ablation",
-    "varsplat-runtime", "cgslam-replica", "cgslam-tum", "cgslam-ablation", "cgslam-runtime",
+    "varsplat-runtime", "varsplat-variance", "cgslam-replica", "cgslam-tum", "cgslam-ablation", "cgslam-runtime",
 }  # fmt: skip
 DEFINITION = """
 title = "Two rooms"
@@ -100,8 +102,18 @@ def test_means_and_deviations_over_seeds(table: Table) -> None:
 
 def test_a_mean_says_how_many_scenes_it_covers(table: Table) -> None:
     cells = table.cells(1, {})
-    *_, ours = rows(table, cells, {cells[0].job.name: ate(0.02), cells[1].job.name: ate(None)})
+    *_, ours = rows(table, cells, {cells[0].job.name: ate(0.02)})
     assert set(ours.values) == {"a", MEAN} and ours.values[MEAN].scenes == 1
+
+
+def test_no_mean_leaves_out_a_missing_score(table: Table) -> None:
+    """As of a run with an empty mesh, or of one that failed."""
+    cells = table.cells(2, {})
+    records = {cell.job.name: {} if (cell.scene, cell.seed) == ("b", 1) else ate(0.02) for cell in cells}
+    *_, ours = rows(table, cells, records)
+    assert ours.values["a"].mean == 2 and ours.values["b"].mean is None and ours.values[MEAN].mean is None
+    text = Written(table, cells, [ours], [], {}).markdown()
+    assert "| 2.00 ± 0.00 | missing (1 of 2 seeds) | missing (1 of 2 seeds) |" in text
 
 
 def test_the_first_key_with_a_value_is_taken(table: Table) -> None:
@@ -138,6 +150,46 @@ def test_scenes_and_systems_can_be_chosen(table: Table) -> None:
         table.cells(1, {}, scenes=["c"])
     with pytest.raises(ConfigError, match="no system 'quick'"):
         table.with_systems(["quick"])
+
+
+def test_a_preset_by_scene_is_chosen_for_all_scenes() -> None:
+    tum = Table.read("varsplat-tum").with_systems(["varsplat-released-{scene}"])
+    configs = {cell.scene: cell.job.config for cell in tum.cells(1, {})}
+    assert len(configs) == 5 and all(
+        preset(f"varsplat-released-{scene}").tracking == config.tracking for scene, config in configs.items()
+    )
+    with pytest.raises(ConfigError, match=r"no system 'varsplat-release-\{scene\}' \(did you mean varsplat-released"):
+        Table.read("varsplat-tum").with_systems(["varsplat-release-{scene}"])
+
+
+@pytest.mark.parametrize(
+    ("scene", "system", "score", "published"),
+    [
+        ("room0", "VarSplat", "ATE, keyframes", 0.2), ("office3", "LoopSplat", "ATE, keyframes", 0.2),
+        ("fr2-xyz", "LoopSplat", "PSNR", 22.68), ("fr3-office", "VarSplat", "LPIPS", 0.248),
+        ("scene0207", "VarSplat", "ATE, keyframes", 6.2), ("281bc17764", "VarSplat", "novel view PSNR", 21.92),
+        ("fr1-room", "CG-SLAM", "ATE, all frames", 9.39), ("office1", "MonoGS", "ATE, keyframes", 0.19),
+        (MEAN, "row IV", "ATE, keyframes", 7.51), (MEAN, "row II", "ATE, keyframes", 7.17),
+    ],
+)  # fmt: skip
+def test_published_numbers_stand_by_scene(scene: str, system: str, score: str, published: float) -> None:
+    found = [
+        row.scores[score][scene]
+        for row in (row for name in list_tables() for row in Table.read(name).published)
+        if row.system == system and scene in row.scores.get(score, {})
+    ]
+    assert published in found
+
+
+def test_a_table_says_what_was_replaced(tmp_path: Path) -> None:
+    table = Table.read("varsplat-tum").with_systems(["VarSplat", "sigma"])
+
+    def lines(*changes: str) -> str:
+        cells = table.cells(1, dict(change.split("=") for change in changes))
+        return "\n".join(Written.of(table, cells, Batch([], tmp_path), 1, {}, None).lines)
+
+    assert "Replaced: NetVLAD, by the built-in descriptor, in VarSplat. NetVLAD: `sigmasplat download" in lines()
+    assert "Replaced" not in lines("loops.weights=net.mat")
 
 
 @pytest.mark.parametrize(

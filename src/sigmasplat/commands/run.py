@@ -126,7 +126,7 @@ def _opened(
     earlier: "FinishedMap | None",
 ) -> tuple["Source", "Config"]:  # fmt: skip
     """Open the source, with warnings; return it with the settings for its scene, or for the earlier map."""
-    from sigmasplat.graph.closer import lacks_weights
+    from sigmasplat.graph.closer import NETVLAD, lacks_netvlad
     from sigmasplat.plugins.sources.live import LiveSource, recording_settings
     from sigmasplat.run.scene import open_scene
 
@@ -147,8 +147,8 @@ def _opened(
         _say_of_scale(screen, asked, source, config)
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
-    if lacks_weights(config.loops) and (config.loops.close or config.mapping.covisibility == "descriptor"):
-        screen.warn("no NetVLAD weights, so the built-in descriptor is used; to use NetVLAD: --set loops.weights=FILE")
+    if lacks_netvlad(config):
+        screen.warn(f"no NetVLAD weights, so the built-in descriptor is used. {NETVLAD}")
     return source, config
 
 

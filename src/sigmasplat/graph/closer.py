@@ -45,17 +45,26 @@ WIDEST = WIDER**2
 
 def make_descriptor(config: LoopConfig) -> Descriptor:
     """Make the descriptor of keyframes. Raises ConfigError if NetVLAD has no weights file or cannot load it."""
-    if config.descriptor == "grid" or lacks_weights(config):
+    if config.descriptor == "grid" or _lacks_weights(config):
         return OrientationGrid()
     if not config.weights:
-        raise ConfigError("loops.descriptor=netvlad needs a file of weights: --set loops.weights=FILE")
+        raise ConfigError(f"loops.descriptor=netvlad needs a file of weights. {NETVLAD}")
     from sigmasplat.graph.netvlad import NetVlad, NetVladWeights
 
     return NetVlad(NetVladWeights.load(config.weights))
 
 
-def lacks_weights(config: LoopConfig) -> bool:
+NETVLAD = "NetVLAD: `sigmasplat download netvlad`, then --set loops.weights=data/netvlad/VGG16-NetVLAD-Pitts30K.mat"
+"""How to get and use the weights."""
+
+
+def lacks_netvlad(config: Config) -> bool:
     """Return whether the built-in descriptor replaces NetVLAD because no file of weights is set."""
+    used = config.loops.close or config.mapping.covisibility == "descriptor"
+    return used and _lacks_weights(config.loops)
+
+
+def _lacks_weights(config: LoopConfig) -> bool:
     return config.descriptor == "netvlad-or-grid" and not config.weights
 
 

@@ -127,12 +127,15 @@ class Table:
         return table
 
     def with_systems(self, names: Sequence[str]) -> "Table":
-        """Return the table with some of its systems only, or presets; without names, with its default systems.
+        """Return the table with some of its systems only, or presets, whose name may end in {scene}; without names,
+        with its default systems.
 
         Raises ConfigError on an unknown name.
         """
         of_table = {system.name: system for system in self.systems}
         presets = [*list_presets(), *presets_by_scene()]
+        ends = [f"-{scene.name}" for scene in self.scenes]
+        presets += [f"{name.removesuffix(end)}-{{scene}}" for end in ends for name in presets if name.endswith(end)]
         known = of_table | {name: System(name, name) for name in presets if name not in of_table}
         for name in names:
             if name not in known:

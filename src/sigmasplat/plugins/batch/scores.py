@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sigmasplat.api import RunFolder, machine, make_folder, number, write_text
+from sigmasplat.api import NETVLAD, RunFolder, lacks_netvlad, machine, make_folder, number, write_text
 from sigmasplat.plugins.batch.batch import Batch
 from sigmasplat.plugins.batch.definition import MEAN, Cell, Score, Table
 from sigmasplat.plugins.batch.job import installed_code
@@ -19,18 +19,20 @@ OURS, PAPER = "ours", "paper"
 class Value:
     """A value of the table: the mean over `seeds` runs and their standard deviation.
 
-    scenes: of the mean over scenes, if it does not cover all of them: how many it covers.
+    mean: None if `missing` of the runs have no such score, which no mean leaves out. scenes: of the mean over scenes,
+    if it does not cover all of them: how many it covers.
     """
 
-    mean: float
+    mean: float | None
     deviation: float | None = None
     seeds: int = 0
     scenes: int | None = None
+    missing: int = 0
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row: a score of a system, published or ours, by scene; a missing value is left out."""
+    """One row: a score of a system, published or ours, by scene; scenes without a run are left out."""
 
     score: Score
     system: str
@@ -77,23 +79,25 @@ def rows(table: Table, cells: Sequence[Cell], records: Mapping[str, Mapping[str,
 def _ours(
     table: Table, score: Score, system: str, cells: Sequence[Cell], records: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Value]:
-    """Return the values of a system by scene, and the mean over scenes of each seed that has all known scenes."""
-    known = dict[str, dict[int, float]]()
+    """Return the values of a system by scene, and the mean over the scenes of each seed that was run on all of them."""
+    made = dict[str, dict[int, float | None]]()
     for cell in cells:
-        value = score.value(records.get(cell.job.name, {})) if cell.system == system else None
-        if value is not None:
-            known.setdefault(cell.scene, {})[cell.seed] = value
-    values = {scene: _value(list(of_seeds.values())) for scene, of_seeds in known.items()}
-    seeds = set.intersection(*(set(of_seeds) for of_seeds in known.values())) if known else set()
+        if cell.system == system and cell.job.name in records:
+            made.setdefault(cell.scene, {})[cell.seed] = score.value(records[cell.job.name])
+    values = {scene: _value(list(of_seeds.values())) for scene, of_seeds in made.items()}
+    seeds = set.intersection(*(set(of_seeds) for of_seeds in made.values())) if made else set()
     if seeds:
-        means = [statistics.fmean(of_seeds[seed] for of_seeds in known.values()) for seed in sorted(seeds)]
-        values[MEAN] = _value(means, len(known) if len(known) < len(table.scenes) else None)
+        means = [_value([of_seeds[seed] for of_seeds in made.values()]).mean for seed in sorted(seeds)]
+        values[MEAN] = _value(means, len(made) if len(made) < len(table.scenes) else None)
     return values
 
 
-def _value(values: Sequence[float], scenes: int | None = None) -> Value:
-    deviation = statistics.stdev(values) if len(values) > 1 else None
-    return Value(statistics.fmean(values), deviation, len(values), scenes)
+def _value(values: Sequence[float | None], scenes: int | None = None) -> Value:
+    known = [value for value in values if value is not None]
+    if len(known) < len(values):
+        return Value(None, None, len(values), scenes, len(values) - len(known))
+    deviation = statistics.stdev(known) if len(known) > 1 else None
+    return Value(statistics.fmean(known), deviation, len(known), scenes)
 
 
 @dataclass(frozen=True)
@@ -112,9 +116,9 @@ class Written:
     ) -> "Written":
         """Read the scores of the finished runs of a batch; settings, limit: what was changed for all runs."""
         finished = {job.name for job in batch.finished()}
-        records = {cell.job.name: run_record(batch.out / cell.job.name) for cell in cells if cell.job.name in finished}
+        records = {name: run_record(batch.out / name) for name in finished} | {key: {} for key in batch.failed}
         conditions = {"settings": dict(settings), "limit": limit, "seeds": seeds, "code": installed_code()}
-        lines = [*_remarks(table, cells, batch, conditions), *table.notes, *_sources(table)]
+        lines = [*_remarks(table, cells, batch, conditions), *_unscored(table, records), *table.notes, *_sources(table)]
         return Written(table, cells, rows(table, cells, records), lines, conditions)
 
     def save(self, folder: Path) -> None:
@@ -136,6 +140,8 @@ class Written:
     def _shown(self, row: Row, value: Value | None) -> str:
         if value is None:
             return number(None, 0)
+        if value.mean is None:
+            return "missing" if value.missing == value.seeds else f"missing ({value.missing} of {value.seeds} seeds)"
         text = number(value.mean, row.score.digits)
         text += "" if value.deviation is None else f" ± {number(value.deviation, row.score.digits)}"
         return text if value.scenes is None else f"{text} ({value.scenes} of {len(self.table.scenes)} scenes)"
@@ -170,7 +176,17 @@ def _remarks(table: Table, cells: Sequence[Cell], batch: Batch, conditions: Mapp
         lines.append(f"Not the settings {of}: {', '.join(changed)}.")
     absent = dict.fromkeys(cell.scene for cell in cells if cell.job.name in batch.missing)
     lines += [f"Missing: {', '.join(absent)}."] if absent else []
+    replaced = dict.fromkeys(cell.system for cell in cells if lacks_netvlad(cell.job.config))
+    lines += [f"Replaced: NetVLAD, by the built-in descriptor, in {', '.join(replaced)}. {NETVLAD}"] if replaced else []
     return lines + [f"Failed: {name}: {why}" for name, why in batch.failed.items()]
+
+
+def _unscored(table: Table, records: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return a line if LPIPS is missing because a run had no weights."""
+    wanted = any(key.endswith(".lpips") for score in table.scores for key in score.keys)
+    without = any(record.get("lpips_network", "") is None for record in records.values())
+    what = "LPIPS is missing for lack of weights: `sigmasplat download lpips alex`, then this command with --overwrite."
+    return [what] if wanted and without else []
 
 
 def _sources(table: Table) -> list[str]:
