@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -11,8 +12,10 @@ import pytest
 
 import file_server as acts
 from archives import folder_content, tar_gz, zipped
+from command_line import exit_code
 from file_server import FileServer, serving
 from sigmasplat.errors import DownloadError
+from sigmasplat.graph.closer import NETVLAD
 from sigmasplat.plugins.download import (
     describe_recordings,
     describe_sets,
@@ -104,6 +107,29 @@ def test_nested_archives_are_unpacked(server: FileServer, tmp_path: Path) -> Non
 
 def checksum(algorithm: str, content: bytes) -> str:
     return f"{algorithm}:{hashlib.new(algorithm, content).hexdigest()}"
+
+
+def test_weights_of_netvlad_are_checked_and_the_command_that_uses_them_is_printed(
+    server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    recording = SETS["netvlad"].recordings[""]
+    (published,) = recording.archives
+    file = replace(published, url=server.url("/Pitts30K_struct.mat"))
+
+    def offer(file: RemoteFile) -> None:
+        offered = {"": replace(recording, archives=(file,))}
+        monkeypatch.setitem(SETS, "netvlad", replace(SETS["netvlad"], recordings=offered))
+
+    offer(file)
+    server.files["/Pitts30K_struct.mat"] = b"not these"
+    assert exit_code("download", "netvlad") == 2
+    said = capsys.readouterr().err
+    assert "its checksum is sha256:" in said and f"not {published.checksum}" in said and not folder_content(tmp_path)
+    offer(replace(file, checksum=checksum("sha256", b"not these")))
+    assert exit_code("download", "netvlad") == 0
+    used = NETVLAD.rpartition("loops.weights=")[2]
+    assert (tmp_path / used).read_bytes() == b"not these" and f"loops.weights={used}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("algorithm", ["sha256", "md5"])

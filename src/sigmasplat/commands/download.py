@@ -17,7 +17,7 @@ Overwrite = Annotated[bool, flag("download existing recordings again")]
 
 def download(
     dataset: Annotated[
-        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips; or list"),
+        str, tyro.conf.Positional, arg("SET", "tum, replica, icl, 7scenes, bonn, redwood; lpips, netvlad; or list"),
     ] = "list",
     names: Annotated[
         tuple[str, ...], tyro.conf.Positional,
@@ -40,8 +40,8 @@ def download(
         return 0
     for public_set, name in [find_recording(dataset, name) for name in names or ("",)]:
         target = _download(screen, public_set, name, out, overwrite)
-        if not public_set.sequences:
-            screen.say("next: sigmasplat eval RUN")
+        if public_set.use:
+            screen.say(f"next: {public_set.use.format(target=target)}")
             continue
         start = target / public_set.recordings[name].start
         try:

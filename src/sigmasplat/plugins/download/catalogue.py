@@ -53,7 +53,7 @@ class PublicSet:
 
     page: about it, and where to apply; folder: below the data folder; recordings: by short name, "" if there is only
     one; disk_ratio: bytes on disk during unpacking, per byte of the archive; prefix: optional prefix of the short
-    names; sequences: whether the recordings are sequences, not weights.
+    names; use: of weights: the command that uses them, with their folder as {target}.
     """
 
     title: str
@@ -63,7 +63,7 @@ class PublicSet:
     recordings: Mapping[str, PublicRecording] = field(default_factory=dict)
     disk_ratio: float = 1.3
     prefix: str = ""
-    sequences: bool = True
+    use: str = ""
 
 
 def _read_sets(text: str) -> dict[str, PublicSet]:
