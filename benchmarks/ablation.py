@@ -29,7 +29,16 @@ from ablation_runs import (
     run_job,
     run_jobs,
 )  # fmt: skip
-from paired_comparison import FIGURES, columns, described, paired_differences, passed_by_chance, rows
+from paired_comparison import (
+    CHANCE,
+    FIGURES,
+    PairedDifference,
+    columns,
+    described,
+    over_sequences,
+    paired_differences,
+    rows,
+)
 from tables import Section
 
 from sigmasplat.commands import options
@@ -117,7 +126,7 @@ def check_sources(study: Study, screen: Screen) -> None:
 
 
 def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds: int) -> list[str]:
-    """Return a line per pair of variants: which figures change, and how likely such a change is by chance."""
+    """Return a line per pair of variants: which figures change, and how often chance alone gives such a line."""
     pairs = [(changed, against) for changed, against in COMPARED if {changed, against} <= set(variants)]
     lines = [
         f"{changed} against {against}: {described(paired_differences(runs, changed, against))}"
@@ -125,12 +134,10 @@ def verdict_lines(variants: Sequence[str], runs: Sequence[dict[str, Any]], seeds
     ]
     if seeds < 2:
         return lines
-    share = f"{passed_by_chance(seeds):.0%}"
-    return [
-        *lines,
-        f"helps, harms: the mean difference at equal seeds is larger than one standard deviation of the {seeds} "
-        f"differences. A change without any effect passes this threshold in {share} of cases by chance.",
-    ]
+    return [*lines, f"helps, harms: {RULE}; {CHANCE:.0%} of figures do so by chance."]
+
+
+RULE = "the 95 % t interval of the mean difference at equal seeds excludes 0"
 
 
 def _announce(screen: Screen, jobs: Sequence[Job], results: Results, job: Job) -> None:
@@ -173,7 +180,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     by_source = {source: [run for run in runs if run["source"] == source] for source in sources}
     seeds, tau = len(measured["seeds"]), measured["config"]["tau"]
     made = [sequence(source, found, tau) for source, found in by_source.items()]
-    return [*made, effects_of(by_source, seeds), *([verdicts(by_source)] if seeds > 1 else [])]
+    return [*made, effects_of(by_source, seeds), *([verdicts(by_source)] if seeds > 1 and len(sources) > 1 else [])]
 
 
 def variants(runs: Runs) -> list[str]:
@@ -192,43 +199,51 @@ def sequence(source: str, runs: Runs, tau: float) -> Section:
 
 
 def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
-    """Tabulate differences at equal seeds; those larger than one standard deviation are bold."""
+    """Tabulate differences at equal seeds; those that show an effect are bold."""
     laid_out = []
     for source, runs in by_source.items():
         for changed, against in compared(runs):
             found = {effect.figure.name: effect for effect in paired_differences(runs, changed, against)}
             cells = [found[figure.name].written() if figure.name in found else "–" for figure in JUDGED]
-            bold = [figure.name in found and found[figure.name].verdict in ("helps", "harms") for figure in JUDGED]
+            bold = [figure.name in found and found[figure.name].stands_out for figure in JUDGED]
             shown = [f"**{cell}**" if stands_out else cell for cell, stands_out in zip(cells, bold, strict=True)]
             laid_out.append([source, f"{changed} against {against}", *shown])
     note = "Mean ± standard deviation of the differences at equal seeds"
     if seeds > 1:
-        note += f"; bold: larger than one deviation ({passed_by_chance(seeds):.0%} of figures are by chance)"
+        note += f"; bold: {RULE} ({CHANCE:.0%} of figures do so by chance)"
     return Section("Effects", ["sequence", "change", *(figure.title for figure in JUDGED)], laid_out, f"{note}.")
 
 
 def verdicts(by_source: dict[str, Runs]) -> Section:
-    """List the figures that each change helps or harms by more than one deviation, and sequences without either."""
+    """List the figures that each change helps or harms over the sequences, and those without a clear effect."""
     laid_out = []
     for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
-        helped, harmed, neither = [], [], []
-        for source, runs in by_source.items():
-            found = paired_differences(runs, changed, against)
-            helped += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "helps"]
-            harmed += [f"{source}: {effect.figure.title}" for effect in found if effect.verdict == "harms"]
-            stands_out = any(effect.verdict in ("helps", "harms") for effect in found)
-            neither += [] if stands_out else [source]
-        cells = [", ".join(names) or "–" for names in (helped, harmed, neither)]
-        laid_out.append([f"{changed} against {against}", *cells])
-    return Section("Verdicts", ["change", "helps", "harms", "all within one deviation"], laid_out)
+        by: dict[str, list[str]] = {"helps": [], "harms": [], "no clear effect": []}
+        for effect in pooled([*by_source.values()], changed, against):
+            shown = "" if effect.verdict == "no clear effect" else f" ({effect.written()})"
+            by[effect.verdict].append(effect.figure.title + shown)
+        laid_out.append([f"{changed} against {against}", *(", ".join(names) or "–" for names in by.values())])
+    note = (
+        f"Over {len(by_source)} sequences: *helps*, *harms* if the 95 % t interval of the sequences' mean differences "
+        f"excludes 0; {CHANCE:.0%} of figures do so by chance. Lengths are compared in percent."
+    )
+    return Section("Verdicts", ["change", "helps", "harms", "no clear effect"], laid_out, note)
+
+
+def pooled(by_source: Sequence[Runs], changed: str, against: str) -> list[PairedDifference]:
+    """Return how a change affects each judged figure over the sequences that have it."""
+    found = [effect for runs in by_source for effect in paired_differences(runs, changed, against)]
+    names = dict.fromkeys(effect.figure.name for effect in found)
+    same = ([effect for effect in found if effect.figure.name == name] for name in names)
+    return [over_sequences(effects) for effects in same if len(effects) > 1]
 
 
 def verdict_counts(measured: dict[str, Any], changed: str, against: str) -> Counter[str]:
-    """Count the verdicts on a change over all sequences and judged figures."""
+    """Count the verdicts on a change, over the sequences, of all judged figures."""
     runs = measured["figures"]["runs"]
     sources = dict.fromkeys(run["source"] for run in runs)
     by_source = [[run for run in runs if run["source"] == source] for source in sources]
-    return Counter(effect.verdict for found in by_source for effect in paired_differences(found, changed, against))
+    return Counter(effect.verdict for effect in pooled(by_source, changed, against))
 
 
 def compared(runs: Runs) -> list[tuple[str, str]]:

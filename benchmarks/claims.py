@@ -1,6 +1,7 @@
 """Measure the claims of VarSplat and CG-SLAM that no other benchmark measures: runs with and without one ingredient.
 
-Small images and short recordings, one thread. Poses are found as in the papers, by descent through the renderer.
+Small images and short recordings, one thread. Poses are found by descent through the renderer, in fewer steps than in
+the papers; the groups "…-own" have the papers' own iterations and rates at 320 pixels, and take hours.
 Finished jobs are kept in runs/bench/claims/NAME.jsonl and are not repeated while code and settings are unchanged.
 Writes benchmarks/results/<name>-<machine>.json; `python benchmarks/tables.py` writes the table of all claims, which
 also reads other results, into docs/claims.md.
@@ -32,11 +33,13 @@ from sigmasplat.files.machine import INSTALLED, code_digest
 arg = tyro.conf.arg
 ROOM = "synthetic:frames=200,width=160,height=120,noise=1,seed={seed}"
 """A different room for each seed, with the noise of a sensor."""
-COMMON = (
-    "input.width=160", "input.hold_every=8", "uncertainty.probes=0", "final.iterations=0", "loops.close=false",
-    "seeding.first_uniform=9600", "seeding.first_gradient=3840",
-)  # fmt: skip
-"""Settings of all runs; --set adds to them. Seeds are as dense as those of the preset at its own width."""
+COMMON = ("input.hold_every=8", "uncertainty.probes=0", "final.iterations=0", "loops.close=false")
+"""Settings of all runs; --set adds to them."""
+SMALL = ("input.width=160", "seeding.first_uniform=9600", "seeding.first_gradient=3840")
+"""Seeds are as dense as those of the preset at its own width."""
+OWN = {"varsplat": "varsplat-own", "cgslam": "cgslam-own"}
+"""Groups with the papers' own iterations and rates; in the table they replace the small ones once they are measured."""
+OWN_SOURCES = {name: ("input.limit=120",) for name in ("redkitchen", "fr1_xyz", "livingroom")}
 DESCENT = ("tracking.method=adam", "tracking.iterations=15", f"tracking.lr_translation={RATES['CG-SLAM'][1]}")
 TERMS_OFF = ("mapping.weight_alignment=0", "mapping.weight_moment=0")
 DOUBLE = "double width"
@@ -53,18 +56,29 @@ class Group:
     sources: dict[str, tuple[str, ...]]
     settings: tuple[str, ...]
     variants: dict[str, tuple[str, ...]]
+    size: tuple[str, ...] = SMALL
 
 
+VARSPLAT = {
+    "V in tracking": ("tracking.uncertainty=true",),
+    "no weights": ("tracking.uncertainty=false",),
+    "no likelihood": ("tracking.uncertainty=false", "mapping.weight_nll_color=0", "mapping.weight_nll_depth=0"),
+}
+CGSLAM = {
+    "full": (),
+    "simplified gradient": ("render.covariance_pose_gradient=false",),
+    "without both": TERMS_OFF,
+    "without isotropy": ("mapping.weight_isotropy_ratio=0",),
+    "without fading": ("primitives.uncertain_m2=0",),
+    "without alignment": TERMS_OFF[:1],
+    "without variance": TERMS_OFF[1:],
+}
 GROUPS: dict[str, Group] = {
     "varsplat": Group(
         "varsplat-fast",
         {name: ("input.stride=2", "input.limit=50") for name in ("redkitchen", "livingroom")},
         (*ONE_MAP, *DESCENT, f"tracking.lr_rotation={RATES['CG-SLAM'][0]}", "tracking.weight_color=0.6"),
-        {
-            "V in tracking": (),
-            "no weights": ("tracking.uncertainty=false",),
-            "no likelihood": ("tracking.uncertainty=false", "mapping.weight_nll_color=0"),
-        },
+        VARSPLAT,
     ),
     "cgslam": Group(
         "cgslam-fast",
@@ -74,16 +88,7 @@ GROUPS: dict[str, Group] = {
             "tracking.weight_color=0.625", "tracking.uncertainty=false", "tracking.alpha_power=0",
             "tracking.alpha_above=0.99", "tracking.outlier_factor=10",
         ),
-        {
-            "full": (),
-            "simplified gradient": ("render.covariance_pose_gradient=false",),
-            "without both": TERMS_OFF,
-            "without isotropy": ("mapping.weight_isotropy_ratio=0",),
-            "without fading": ("primitives.uncertain_m2=0",),
-            "without alignment": TERMS_OFF[:1],
-            "without variance": TERMS_OFF[1:],
-            DOUBLE: ("input.width=320", "seeding.first_uniform=38400", "seeding.first_gradient=15360"),
-        },
+        CGSLAM | {DOUBLE: ("input.width=320", "seeding.first_uniform=38400", "seeding.first_gradient=15360")},
     ),
     "submaps": Group(
         "varsplat-fast",
@@ -95,9 +100,12 @@ GROUPS: dict[str, Group] = {
         (*ONE_MAP, "submaps.frames=20"),
         {"submaps": ()},
     ),
+    OWN["varsplat"]: Group("varsplat-tum", OWN_SOURCES, (), VARSPLAT, ("input.width=320", "input.crop_px=8")),
+    OWN["cgslam"]: Group("cgslam-tum", OWN_SOURCES, (), CGSLAM, ("input.width=320", "input.crop_px=4")),
 }  # fmt: skip
 """The variants of a group are made in this order, each on all sequences with all seeds. "double width": the others are
-the light form of it. In "submaps" nothing is left out: its maps are registered with several settings."""
+the light form of it. In "submaps" nothing is left out: its maps are registered with several settings. In "…-own",
+`crop_px` is the preset's, scaled as the images are."""
 REGISTRATIONS = {"mean over pixels": "pixels", "mean over values": "values"}
 PLATEAUS = {"no stop": (0.0, 10), "window 10": (1e-4, 10), "window 1": (1e-4, 1)}
 """How submaps of a run are registered, and where the descent stops that localises held-back frames: at steps that lower
@@ -109,7 +117,9 @@ RUNS = record.ROOT / "runs" / "bench" / "claims"
 class Options:
     """Measure the claims of VarSplat and CG-SLAM that no other benchmark measures."""
 
-    groups: Annotated[tuple[str, ...], arg(help=f"what to measure: {', '.join(GROUPS)}")] = (*GROUPS,)
+    groups: Annotated[tuple[str, ...], arg(help=f"what to measure: {', '.join(GROUPS)}")] = tuple(
+        name for name in GROUPS if name not in OWN.values()
+    )
     sources: Annotated[tuple[str, ...], arg(help="sequences", help_behavior_hint="(default: those of the group)")] = ()
     variants: Annotated[
         tuple[str, ...], arg(help="runs to make", help_behavior_hint="(default: all of the group)")
@@ -164,7 +174,7 @@ def jobs_of(options: Options) -> list[Job]:
         if unknown:
             raise ConfigError(f"no {unknown[0]!r}; there are {', '.join(known)}")
     listed = [
-        Job(name, source, seed, variant, (*COMMON, *group.settings, *ours, *options.settings, *changes))
+        Job(name, source, seed, variant, (*group.size, *COMMON, *group.settings, *ours, *options.settings, *changes))
         for name, group in ((name, GROUPS[name]) for name in options.groups)
         for variant, changes in group.variants.items()
         if not options.variants or variant in options.variants

@@ -11,9 +11,14 @@ Runs = list[dict[str, Any]]
 Claimed = Literal["less", "more", "no worse"]
 
 
-def of_rows(group: str) -> Callable[[dict[str, Any]], Runs]:
-    """Return what reads the rows of one group: results of claims.py and weights.py."""
-    return lambda measured: [run for run in measured["figures"]["runs"] if run["group"] == group]
+def of_rows(*groups: str) -> Callable[[dict[str, Any]], Runs]:
+    """Return what reads the rows of the first of these groups that was measured by claims.py or weights.py."""
+
+    def read(measured: dict[str, Any]) -> Runs:
+        by = {group: [run for run in measured["figures"]["runs"] if run["group"] == group] for group in groups}
+        return next((runs for runs in by.values() if runs), [])
+
+    return read
 
 
 def of_runs(measured: dict[str, Any]) -> Runs:
@@ -32,42 +37,31 @@ def of_jobs(measured: dict[str, Any]) -> Runs:
 
 
 def of_scenes(measured: dict[str, Any]) -> Runs:
-    """Read consistency.py: its scenes with their seeds as one sequence, whose differences are pooled."""
-    jobs = [result for result in measured["figures"]["jobs"] if result["problem"] is None]
-    scenes = list(dict.fromkeys(result["job"]["source"] for result in jobs))
+    """Read the jobs of consistency.py, whose variants leave out a part of the method."""
     return [
-        {
-            "source": f"{len(scenes)} scenes",
-            "variant": result["variant"],
-            "seed": scenes.index(result["job"]["source"]) + len(scenes) * result["job"]["seed"],
-            "figures": result["figures"],
-        }
-        for result in jobs
+        {"source": result["job"]["source"], "seed": result["job"]["seed"]}
+        | {"variant": result["variant"], "figures": result["figures"]}
+        for result in measured["figures"]["jobs"]
+        if result["problem"] is None
     ]
 
 
 def of_ways(measured: dict[str, Any]) -> Runs:
-    """Read the sequences of pose_gradient.py as one, whose differences are pooled; a variant is a list of paths."""
-    runs = [run for run in measured["figures"]["sequence"] if run["problem"] is None]
-    sources = list(dict.fromkeys(run["source"] for run in runs))
-    return [
-        {
-            "source": f"{len(sources)} sequences",
-            "variant": run["way"],
-            "seed": sources.index(run["source"]) + len(sources) * run["seed"],
-            "figures": run["figures"],
-        }
-        for run in runs
-    ]
+    """Read the sequences of pose_gradient.py; a variant is a list of paths of the gradient."""
+    return [run | {"variant": run["way"]} for run in measured["figures"]["sequence"] if run["problem"] is None]
 
 
 def of_scores(quantity: str, pixels: str) -> Callable[[dict[str, Any]], Runs]:
-    """Return what reads uncertainty.py: scores of held-back views of final maps; a variant is a predictor."""
+    """Return what reads uncertainty.py: scores of held-back views of final maps; a variant is a predictor.
+
+    The synthetic rooms with steady exposure are the synthetic rooms again, not another sequence.
+    """
 
     def read(measured: dict[str, Any]) -> Runs:
         return [
             {"source": run["source"], "variant": name, "seed": run["seed"], "figures": scores}
             for run in measured["figures"]["runs"]
+            if run["source"] != "synthetic, steady exposure"
             for name, scores in run["scores"][quantity]["final"]["held back"][pixels]["predictors"].items()
         ]
 
@@ -88,7 +82,8 @@ def of_loops(measured: dict[str, Any]) -> Runs:
 class Evidence:
     """Where a figure is measured: results by name, what reads them, and the variants to compare.
 
-    Without `against`, the figure itself is compared with 0. repeats: what the runs of a sequence differ in.
+    Without `against`, the figure itself is compared with 0. preset: that of the runs, in other settings than the
+    paper's; own: the group of claims.py that has the paper's own iterations and rates, if there is one.
     """
 
     results: str
@@ -96,7 +91,14 @@ class Evidence:
     figure: Figure
     changed: str
     against: str | None = None
-    repeats: str = "seeds"
+    preset: str = ""
+    own: str = ""
+
+    def family(self, measured: dict[str, Any]) -> str:
+        """Return the family of the settings that the runs were made with."""
+        runs = self.read(measured)
+        owned = self.own and runs and runs[0].get("group") == self.own
+        return "the paper's own" if owned else f"other: `{self.preset}`"
 
 
 @dataclass(frozen=True)

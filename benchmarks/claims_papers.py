@@ -3,6 +3,7 @@
 The published figures are those of the papers; a claim is measured by what `claims_evidence.py` reads.
 """
 
+from claims import GROUPS, OWN
 from claims_evidence import (
     Claim,
     Evidence,
@@ -37,37 +38,39 @@ HELD_OUT_DEPTH = Figure("held_out_depth_l1_m", "depth L1", "cm", -1, 100.0)
 
 
 def in_claims(group: str, figure: Figure, changed: str, against: str | None = None) -> Evidence:
-    """Return evidence from claims.py."""
-    return Evidence("claims", of_rows(group), figure, changed, against)
+    """Return evidence from claims.py: of the paper's own settings if they were measured."""
+    own = OWN.get(group, "")
+    own = own if own and {changed, against} <= {*GROUPS[own].variants} else ""
+    preset = GROUPS.get(group, GROUPS["submaps"]).preset
+    return Evidence("claims", of_rows(*filter(None, (own, group))), figure, changed, against, preset, own)
 
 
 def in_weights(group: str, figure: Figure, changed: str, against: str) -> Evidence:
-    """Return evidence from weights.py, which runs `sigma`."""
-    return Evidence("weights", of_rows(group), figure, changed, against)
+    """Return evidence from weights.py."""
+    return Evidence("weights", of_rows(group), figure, changed, against, "sigma")
 
 
 def in_ablation(changed: str, against: str) -> Evidence:
-    """Return evidence on the ATE from ablation.py, which runs `varsplat-fast`."""
-    return Evidence("ablation", of_runs, ATE, changed, against)
+    """Return evidence on the ATE from ablation.py."""
+    return Evidence("ablation", of_runs, ATE, changed, against, "varsplat-fast")
 
 
 def in_systems(figure: Figure, changed: str, against: str) -> Evidence:
     """Return evidence from systems.py: one preset against another."""
-    return Evidence("systems", of_jobs, figure, changed, against)
+    return Evidence("systems", of_jobs, figure, changed, against, changed)
 
 
 def in_scenes(figure: Figure, without: str) -> Evidence:
-    """Return evidence from consistency.py, which leaves out parts of `cgslam-fast`."""
-    return Evidence("consistency", of_scenes, figure, "full", without, "pairs of scene and seed")
+    """Return evidence from consistency.py, which leaves out parts of the method."""
+    return Evidence("consistency", of_scenes, figure, "full", without, "cgslam-fast")
 
 
 NO_NUMBER = "no number"
-DESCENT = "descent through the renderer, 30 steps"
-NO_DATA = "the data set is not available here; `sigmasplat bench table {}` measures it where the data is"
+NO_DATA = "`sigmasplat bench table {}`, where the data is"
 VARSPLAT = (
     Claim(
         "V ranks the errors of colour", NO_NUMBER, "more",
-        Evidence("uncertainty", of_scores("color", "all pixels"), RANK, "V"),
+        Evidence("uncertainty", of_scores("color", "all pixels"), RANK, "V", None, "sigma"),
         "Spearman of V and squared error at held-back views",
     ),
     Claim(
@@ -76,11 +79,14 @@ VARSPLAT = (
     ),
     Claim(
         "V in tracking lowers the ATE", "ablation, ScanNet: 8.20 → 7.63 cm", "less",
-        in_claims("varsplat", ATE, "V in tracking", "no weights"), "descent through the renderer, 15 steps",
+        in_claims("varsplat", ATE, "V in tracking", "no weights"),
     ),
-    Claim("the same in `varsplat-fast`, by alignment of images", "as above", "less", in_ablation("+tracking", "none")),
     Claim(
-        "the same in `sigma`, by alignment of images", "as above", "less",
+        "V in the alignment of images lowers the ATE (`varsplat-fast`)", "as above", "less",
+        in_ablation("+tracking", "none"),
+    ),
+    Claim(
+        "V in the alignment of images lowers the ATE (`sigma`)", "as above", "less",
         in_weights("path", ATE, "default", "tracking: no weights"),
     ),
     Claim(
@@ -105,7 +111,7 @@ VARSPLAT = (
     ),
     Claim(
         "loop closure lowers the ATE (LoopSplat's part)", NO_NUMBER, "less",
-        Evidence("loops", of_loops, ATE, "loops", "no loops"), "rooms with drifting depth",
+        Evidence("loops", of_loops, ATE, "loops", "no loops", "sigma"), "rooms with drifting depth",
     ),
     Claim(
         "VarSplat's ATE is lower than LoopSplat's",
@@ -117,11 +123,11 @@ VARSPLAT = (
         in_weights("path", LOST, "default", "tracking: no weights"),
     ),
     Claim(
-        "accumulated tracking uncertainty shows where submaps should end", "§2: a rule without a formula", "more",
+        "accumulated tracking uncertainty shows where submaps should end", "a rule without a formula", "more",
         None, "not reproduced by V (commit 780358915); the rule is gone",
     ),
     Claim(
-        "ours: the accumulated covariance of the pose shows it", "not in the paper", "more",
+        "ours: the accumulated covariance of the pose shows where submaps should end", "not in the paper", "more",
         in_claims("hops", HOPS, "covariance"),
     ),
     Claim(
@@ -141,11 +147,11 @@ VARSPLAT = (
         in_claims("varsplat", CPU, "V in tracking", "no likelihood"),
     ),
     Claim(
-        "registration averages colour errors over values (3HW), not pixels (HW)", "§5: formula, no number", "less",
+        "registration averages colour errors over values (3HW), not pixels (HW)", "a formula, no number", "less",
         in_claims("registration", ERROR, "mean over values", "mean over pixels"),
     ),
     Claim(
-        "localisation may stop on a plateau (ours: 10 steps)", "§5: stop at small steps", "no worse",
+        "localisation may stop on a plateau (ours: 10 steps)", "a stop at small steps", "no worse",
         in_claims("localisation", LOCALISED, "window 10", "no stop"),
     ),
     Claim(
@@ -173,22 +179,28 @@ VARSPLAT = (
 CGSLAM = (
     Claim(
         "U ranks the errors of depth", NO_NUMBER, "more",
-        Evidence("uncertainty", of_scores("depth", "covered pixels"), RANK, "U"),
+        Evidence("uncertainty", of_scores("depth", "covered pixels"), RANK, "U", None, "sigma"),
         "Spearman of U and squared error at held-back views; U about the rendered depth",
     ),
     Claim(
         "alignment and variance bring splats to the surface", "ablation, Replica: Chamfer 4.79 → 3.85 cm", "less",
-        in_scenes(TO_SURFACE, "without both"), "`cgslam-fast`, by alignment of images, rooms with noise",
+        in_scenes(TO_SURFACE, "without both"),
     ),
-    Claim("alignment alone brings them there", "4.74 → 3.85 cm", "less", in_scenes(TO_SURFACE, "without alignment")),
-    Claim("variance alone brings them there", "4.57 → 3.85 cm", "less", in_scenes(TO_SURFACE, "without variance")),
+    Claim(
+        "alignment alone brings splats to the surface", "4.74 → 3.85 cm", "less",
+        in_scenes(TO_SURFACE, "without alignment"),
+    ),
+    Claim(
+        "variance alone brings splats to the surface", "4.57 → 3.85 cm", "less",
+        in_scenes(TO_SURFACE, "without variance"),
+    ),
     Claim(
         "alignment and variance lower the ATE", "ablation, Replica: 0.33 → 0.26 cm", "less",
-        in_scenes(ATE, "without both"), "`cgslam-fast`, by alignment of images",
+        in_scenes(ATE, "without both"),
     ),
     Claim(
         "isotropy lowers the ATE", "Replica: office3 0.72 → 0.31 cm", "less",
-        in_scenes(ATE, "without isotropy"), "`cgslam-fast`, by alignment of images",
+        in_scenes(ATE, "without isotropy"),
     ),
     Claim("isotropy leaves fewer floaters", NO_NUMBER, "less", in_scenes(FLOATERS, "without isotropy")),
     Claim(
@@ -196,39 +208,39 @@ CGSLAM = (
         in_scenes(FLOATERS, "without primitive uncertainty"),
     ),
     Claim(
-        "alignment and variance bring splats to the surface", "Chamfer 4.79 → 3.85 cm", "less",
-        in_claims("cgslam", CHAMFER, "full", "without both"), DESCENT,
+        "alignment and variance bring splats to the surface, by descent", "Chamfer 4.79 → 3.85 cm", "less",
+        in_claims("cgslam", CHAMFER, "full", "without both"),
     ),
     Claim(
-        "alignment alone brings them there", "4.74 → 3.85 cm", "less",
-        in_claims("cgslam", CHAMFER, "full", "without alignment"), DESCENT,
+        "alignment alone brings splats to the surface, by descent", "4.74 → 3.85 cm", "less",
+        in_claims("cgslam", CHAMFER, "full", "without alignment"),
     ),
     Claim(
-        "variance alone brings them there", "4.57 → 3.85 cm", "less",
-        in_claims("cgslam", CHAMFER, "full", "without variance"), DESCENT,
+        "variance alone brings splats to the surface, by descent", "4.57 → 3.85 cm", "less",
+        in_claims("cgslam", CHAMFER, "full", "without variance"),
     ),
     Claim(
-        "alignment and variance lower the ATE", "ablation, Replica: 0.33 → 0.26 cm", "less",
-        in_claims("cgslam", ATE, "full", "without both"), DESCENT,
+        "alignment and variance lower the ATE, by descent", "ablation, Replica: 0.33 → 0.26 cm", "less",
+        in_claims("cgslam", ATE, "full", "without both"),
     ),
     Claim(
         "alignment alone lowers the ATE", "0.28 → 0.26 cm", "less",
-        in_claims("cgslam", ATE, "full", "without alignment"), DESCENT,
+        in_claims("cgslam", ATE, "full", "without alignment"),
     ),
     Claim(
         "variance alone lowers the ATE", "0.30 → 0.26 cm", "less",
-        in_claims("cgslam", ATE, "full", "without variance"), DESCENT,
+        in_claims("cgslam", ATE, "full", "without variance"),
     ),
     Claim(
         "isotropy lowers the ATE and prevents failure", "office3 0.72 → 0.31 cm; office4 fails without it", "less",
-        in_claims("cgslam", ATE, "full", "without isotropy"), DESCENT,
+        in_claims("cgslam", ATE, "full", "without isotropy"),
     ),
     Claim(
         "pruning by the uncertainty of primitives lowers the ATE", "a curve for room1, no number", "less",
-        in_claims("cgslam", ATE, "full", "without fading"), DESCENT,
+        in_claims("cgslam", ATE, "full", "without fading"),
     ),
     Claim(
-        "the same improves depth in `sigma`", NO_NUMBER, "less",
+        "the same pruning improves depth in `sigma`", NO_NUMBER, "less",
         in_weights("path", DEPTH, "default", "pruning: no fading"),
     ),
     Claim(
@@ -241,12 +253,11 @@ CGSLAM = (
     ),
     Claim(
         "the complete pose gradient is more accurate than the released code's", NO_NUMBER, "less",
-        Evidence("pose-gradient", of_ways, ATE, "+ covariance", "mean + depth", "pairs of sequence and seed"),
-        "`varsplat-fast`, descent of 30 steps",
+        Evidence("pose-gradient", of_ways, ATE, "+ covariance", "mean + depth", "varsplat-fast"),
     ),
     Claim(
-        "the same in `cgslam-fast`", NO_NUMBER, "less", in_claims("cgslam", ATE, "full", "simplified gradient"),
-        "without the path through the 2D covariance; " + DESCENT,
+        "the same of `cgslam-fast`", NO_NUMBER, "less", in_claims("cgslam", ATE, "full", "simplified gradient"),
+        "without the path through the 2D covariance",
     ),
     Claim(
         "the light form needs less time", "runtime, office0: 8.5 → 15.4 frames/s", "less",
@@ -266,7 +277,7 @@ CGSLAM = (
     ),
     Claim(
         "NetVLAD chooses the window faster than overlap", "stated, no number", "less", None,
-        "its weights are a download with their own licence",
+        "`sigmasplat download netvlad` gets its weights",
     ),
     Claim("ATE on Replica, TUM, ScanNet", "0.27, 4.0, 8.08 cm", "less", None, NO_DATA.format("cgslam-replica")),
     Claim(

@@ -1,10 +1,9 @@
 """Compare the claims of both papers with what was measured here: one table over several results, with verdicts.
 
-`tables.py` writes it into docs/results/claims.md. No verdict is typed: each follows from the
-differences at equal seeds by the rule of `verdict`.
+`tables.py` writes it into docs/results/claims.md, and lists of what holds into docs/claims.md. No verdict is typed:
+each follows from the differences at equal seeds by the rule of `verdict`.
 """
 
-import statistics
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,79 +12,60 @@ from typing import Any
 import record
 from claims_evidence import Claim, Evidence
 from claims_papers import ATE, CHAMFER, CPU, DEPTH, ERROR, FLOATERS, HOPS, PAPERS, PSNR, RANK, SPLATS, STEPS
-from paired_comparison import (
-    Figure,
-    PairedDifference,
-    by_seed,
-    deviation,
-    passed_by_chance,
-    rows,
-)
+from paired_comparison import Figure, PairedDifference, by_seed, difference, interval, over_sequences, rows
 from result_pages import link
 from tables import Section
 
+from sigmasplat.run.figures import number
+
 LEAST_SEEDS = 3
+HOLDS, OPPOSITE, UNCLEAR = "holds", "the opposite", "no clear effect"
+ONE_SEQUENCE = "one sequence only: not tested"
+FEW_SEEDS = f"fewer than {LEAST_SEEDS} seeds: not tested"
 NOT_MEASURABLE = "not measurable here"
+MARGINS = {"%": 5.0, "dB": 0.42}
+"""How much worse "not worse" may be: an error 5 % larger, which is 0.42 dB for the RMSE of colours."""
 
 
 # ---- verdicts ----
 
 
 def differences(evidence: Evidence, measured: dict[str, Any]) -> dict[str, PairedDifference]:
-    """Return the difference at equal seeds for each sequence with enough seeds."""
+    """Return the differences at equal seeds of each sequence, or the values if nothing is compared."""
     found = {}
     runs = evidence.read(measured)
     for source in dict.fromkeys(run["source"] for run in runs):
-        here = [run for run in runs if run["source"] == source and run["figures"].get(evidence.figure.name) is not None]
-        values = by_seed(here, evidence.changed, evidence.figure)
-        if evidence.against is not None:
-            base = by_seed(here, evidence.against, evidence.figure)
-            values = {seed: value - base[seed] for seed, value in values.items() if seed in base}
-        if len(values) >= LEAST_SEEDS:
-            each = [*values.values()]
-            found[source] = PairedDifference(evidence.figure, statistics.fmean(each), deviation(each))
+        here = [run for run in runs if run["source"] == source]
+        if evidence.against is None:
+            values = tuple(by_seed(here, evidence.changed, evidence.figure).values())
+            compared = PairedDifference(evidence.figure, values) if values else None
+        else:
+            compared = difference(here, evidence.changed, evidence.against, evidence.figure)
+        if compared:
+            found[source] = compared
     return found
 
 
-def sign(difference: PairedDifference) -> int:
-    """Return +1 or −1 if the mean is larger than one deviation, by its sign; otherwise 0."""
-    beyond = abs(difference.mean) > (difference.deviation or 0.0)
-    return (1 if difference.mean > 0 else -1) if beyond else 0
-
-
-def agreement(claim: Claim, found: Sequence[PairedDifference]) -> tuple[int, int]:
-    """Return on how many sequences the difference is as claimed, and on how many the opposite, beyond one deviation.
-
-    "no worse" holds within one deviation too.
-    """
-    signs = [sign(difference) for difference in found]
-    if claim.claimed == "no worse":
-        worse = sum(s * d.figure.better < 0 for s, d in zip(signs, found, strict=True))
-        return len(found) - worse, worse
-    wanted = 1 if claim.claimed == "more" else -1
-    return signs.count(wanted), signs.count(-wanted)
+def counting(found: dict[str, PairedDifference]) -> list[PairedDifference]:
+    """Return the differences of the sequences that have enough seeds to count."""
+    return [difference for difference in found.values() if len(difference.each) >= LEAST_SEEDS]
 
 
 def verdict(claim: Claim, found: Sequence[PairedDifference]) -> str:
-    """Return the verdict on a claim from its differences, one for each sequence.
+    """Return the verdict on a claim from its differences, one for each sequence with enough seeds.
 
-    *reproduced*: as claimed on more than half of the sequences; *the opposite*: the opposite on more than half;
-    otherwise *not reproduced*.
+    *holds*: the 95 % t interval of the sequences' means lies on the claimed side of 0 (of the margin, if the claim is
+    that something is not worse); *the opposite*: on the other side of 0; otherwise *no clear effect*.
     """
-    if not found:
-        return "not measured yet"
-    held, opposite = agreement(claim, found)
-    if 2 * held > len(found):
-        return "reproduced"
-    return "the opposite" if 2 * opposite > len(found) else "not reproduced"
-
-
-def counted(claim: Claim, found: Sequence[PairedDifference]) -> str:
-    """Count the sequences as claimed and those with the opposite; the others are within one deviation."""
-    held, opposite = agreement(claim, found)
-    if claim.claimed == "no worse":
-        return f"worse on {opposite} of {len(found)}"
-    return f"as claimed on {held} of {len(found)}" + (f", the opposite on {opposite}" if opposite else "")
+    if len(found) < 2:
+        return ONE_SEQUENCE
+    pooled = over_sequences(found)
+    low, high = interval(pooled.each) or (0.0, 0.0)
+    wanted = {"more": 1, "less": -1, "no worse": pooled.figure.better}[claim.claimed]
+    low, high = sorted((wanted * low, wanted * high))
+    if low > (-MARGINS[pooled.figure.unit] if claim.claimed == "no worse" else 0.0):
+        return HOLDS
+    return OPPOSITE if high < 0 else UNCLEAR
 
 
 def verdict_counts(paper: str, folder: Path = record.RESULTS) -> Counter[str]:
@@ -99,9 +79,10 @@ def judged(claim: Claim, folder: Path) -> tuple[str, dict[str, PairedDifference]
         return NOT_MEASURABLE, {}
     measured = results_of(claim.evidence, folder)
     found = differences(claim.evidence, measured)
-    if found and not any(values_of(claim.evidence, measured)):
+    if not any(values_of(claim.evidence, measured)):
         return NOT_MEASURABLE, {}
-    return verdict(claim, [*found.values()]), found
+    enough = counting(found)
+    return verdict(claim, enough) if enough else FEW_SEEDS, found
 
 
 def results_of(evidence: Evidence, folder: Path) -> dict[str, Any]:
@@ -116,19 +97,29 @@ def row(claim: Claim, folder: Path) -> list[str]:
     """Return the row of a claim. Raises KeyError if its results are missing."""
     evidence, (judgement, found) = claim.evidence, judged(claim, folder)
     if evidence is None:
-        return [claim.said, claim.published, f"– ({claim.remark})", judgement, "–"]
-    results = link(evidence.results)
+        return [claim.said, claim.published, "–", f"– ({claim.remark})", "–", judgement, "–"]
+    results, measured = link(evidence.results), results_of(evidence, folder)
+    family = evidence.family(measured)
     if not found:
-        why = f"{evidence.figure.title}: 0 in all runs" if judgement == NOT_MEASURABLE else "–"
-        return [claim.said, claim.published, why, judgement, results]
-    measured = results_of(evidence, folder)
+        return [claim.said, claim.published, family, f"{evidence.figure.title}: 0 in all runs", "–", judgement, results]
     cells = [f"{source} {_written(difference)}" for source, difference in found.items()]
     title = evidence.figure.title + (f", {evidence.figure.unit}" if evidence.figure.unit else "")
     what = f"{evidence.changed} − {evidence.against}" if evidence.against else evidence.changed
     text = f"{title}, *{what}*: {'; '.join(cells)}" + (f" ({claim.remark})" if claim.remark else "")
-    counts = counted(claim, [*found.values()])
-    provenance = f"{results}, {seeds(evidence, measured)} {evidence.repeats}, {(measured['commit'] or 'no commit')[:9]}"
-    return [claim.said, claim.published, text, f"**{judgement}**: {counts}", provenance]
+    seeds = min(len(difference.each) for difference in counting(found) or found.values())
+    provenance = f"{results}, {seeds} seeds, {(measured['commit'] or 'no commit')[:9]}"
+    return [claim.said, claim.published, family, text, effect(found), f"**{judgement}**", provenance]
+
+
+def effect(found: dict[str, PairedDifference]) -> str:
+    """Return the mean over sequences and its 95 % interval; a dash for a single sequence."""
+    enough = counting(found)
+    if len(enough) < 2:
+        return "–"
+    pooled = over_sequences(enough)
+    low, high = interval(pooled.each) or (0.0, 0.0)
+    mean, low_text, high_text = (number(value, pooled.figure.digits) for value in (pooled.mean, low, high))
+    return f"{mean} [{low_text}, {high_text}] {pooled.figure.unit}".rstrip()
 
 
 def values_of(evidence: Evidence, measured: dict[str, Any]) -> list[float]:
@@ -138,19 +129,15 @@ def values_of(evidence: Evidence, measured: dict[str, Any]) -> list[float]:
     return [float(value) for value in found if value is not None]
 
 
-def seeds(evidence: Evidence, measured: dict[str, Any]) -> int:
-    """Return the number of seeds of the sequence that has the fewest, of those that count."""
-    runs = [run for run in evidence.read(measured) if run["variant"] == evidence.changed]
-    counts = [len({r["seed"] for r in runs if r["source"] == source}) for source in differences(evidence, measured)]
-    return min(counts)
-
-
 def _written(difference: PairedDifference) -> str:
-    text = difference.written().removesuffix(difference.figure.unit).rstrip()
-    return f"**{text}**" if sign(difference) else text
+    text = difference.written().removesuffix(difference.figure.unit).rstrip().replace(" ± ", "±")
+    return f"**{text}**" if difference.stands_out else text
 
 
-HEAD = ["claim", "paper", "measured here: difference at equal seeds, mean ± standard deviation", "verdict", "results"]
+HEAD = [
+    "claim", "paper", "settings", "difference at equal seeds, mean ± standard deviation",
+    "over sequences, 95 % interval", "verdict", "results",
+]  # fmt: skip
 
 
 def table(folder: Path = record.RESULTS) -> str:
@@ -165,14 +152,39 @@ def table(folder: Path = record.RESULTS) -> str:
 def note() -> str:
     """Return the rule of the verdicts in words."""
     return (
-        "**Bold** differences are larger than one standard deviation, which "
-        f"{passed_by_chance(LEAST_SEEDS):.0%} of differences are by chance with {LEAST_SEEDS} seeds. *Reproduced*: the "
-        "difference has the claimed sign and is larger than one standard deviation on more than half of the sequences. "
-        "*The opposite*: the same with the opposite sign. Otherwise *not reproduced*. A claim that something is not "
-        "worse is reproduced if the difference is not worse by more than one standard deviation on more than half of "
-        f"the sequences. A sequence with fewer than {LEAST_SEEDS} seeds does not count. Results without a link are in "
-        "`benchmarks/results/` only."
+        "[The rule of the verdicts](../claims.md#the-rule). **Bold** differences: the 95 % t interval over the seeds "
+        f"of this sequence excludes 0. A sequence with fewer than {LEAST_SEEDS} seeds does not count. Results without "
+        "a link are in `benchmarks/results/` only."
     )
+
+
+LISTS = {
+    "What holds": {HOLDS: ""},
+    "What does not": {OPPOSITE: "the opposite", UNCLEAR: "no clear effect"},
+    "What could not be tested": {
+        ONE_SEQUENCE: "one sequence only", FEW_SEEDS: f"fewer than {LEAST_SEEDS} seeds",
+        NOT_MEASURABLE: "not measurable here",
+    },
+}  # fmt: skip
+"""Lists of docs/claims.md: their title, and the verdicts in them with their words."""
+
+
+def lists(folder: Path = record.RESULTS) -> str:
+    """Write what holds, what does not, and what could not be tested. Raises KeyError if results are missing."""
+    made = []
+    for title, verdicts in LISTS.items():
+        lines, count = [], 0
+        for paper, claims in PAPERS.items():
+            for judgement, word in verdicts.items():
+                said = [
+                    claim.said + (f" ({shown})" if (shown := effect(found)) != "–" else "")
+                    for claim, (found_judgement, found) in ((claim, judged(claim, folder)) for claim in claims)
+                    if found_judgement == judgement
+                ]
+                count += len(said)
+                lines += [f"- **{paper}**{word and f', {word}'}: {'; '.join(said)}.\n"] if said else []
+        made.append(f"## {title}: {count}\n\n{''.join(lines)}")
+    return "\n" + "\n".join(made) + "\n"
 
 
 # ---- the results of claims.py alone ----

@@ -21,12 +21,13 @@ import record
 import tyro
 from accuracy_tables import failures
 from paired_comparison import (
+    CHANCE,
     Figure,
     PairedDifference,
     best,
     by_seed,
-    deviation,
-    passed_by_chance,
+    difference,
+    over_sequences,
     rows,
 )
 from systems import with_surface
@@ -192,33 +193,32 @@ def mean_of(scenes: Scenes, variants: list[str]) -> Section:
     return Section("Mean of scenes", ["variant", *HEADS], laid_out if scenes else [])
 
 
-def differences(scenes: Scenes, variant: str, figure: Figure) -> list[float]:
-    """Return the differences of a variant to the full method, at equal scene and seed, in the figure's unit."""
-    pairs = [(by_seed(runs, variant, figure), by_seed(runs, FULL, figure)) for runs in scenes.values()]
-    return [there[seed] - full[seed] for there, full in pairs for seed in there if seed in full]
+def differences(scenes: Scenes, variant: str, figure: Figure) -> list[PairedDifference]:
+    """Return the differences of a variant to the full method at equal seeds, scene by scene."""
+    found = (difference(runs, variant, FULL, figure) for runs in scenes.values())
+    return [of_scene for of_scene in found if of_scene is not None]
 
 
 def effects_of(scenes: Scenes, variants: list[str]) -> Section:
-    """Tabulate the differences to the full method; those larger than one standard deviation are bold."""
-    laid_out, most = [], 0
-    for variant in (variant for variant in variants if variant != FULL):
-        changes = [(figure, differences(scenes, variant, figure)) for figure in JUDGED]
-        most = max(most, *(len(found) for _, found in changes))
-        laid_out.append([variant, *(_effect(figure, found) for figure, found in changes)])
+    """Tabulate the differences to the full method; those that show an effect over the scenes are bold."""
+    others = [variant for variant in variants if variant != FULL]
+    found = {variant: [differences(scenes, variant, figure) for figure in JUDGED] for variant in others}
+    laid_out = [[variant, *map(_effect, changes)] for variant, changes in found.items()]
     note = (
-        "Difference to the full method at equal scene and seed: mean ± standard deviation, and how often it is worse."
+        "Difference to the full method at equal scene and seed: mean ± standard deviation, and how often it is worse. "
+        f"Bold: the 95 % t interval of the scenes' means excludes 0; {CHANCE:.0%} of figures do so by chance."
     )
-    if most > 1:
-        note += f" Bold: larger than one deviation ({passed_by_chance(most):.1%} of figures are by chance)."
-    return Section("Effects", ["variant", *(f.title for f in JUDGED)], laid_out if most else [], note)
+    measured = any(any(changes) for changes in found.values())
+    return Section("Effects", ["variant", *(f.title for f in JUDGED)], laid_out if measured else [], note)
 
 
-def _effect(figure: Figure, changes: list[float]) -> str:
-    if not changes:
+def _effect(of_scenes: list[PairedDifference]) -> str:
+    if not of_scenes:
         return "–"
-    effect = PairedDifference(figure, statistics.fmean(changes), deviation(changes))
-    worse = sum(figure.better * change < 0 for change in changes)
-    return f"{_marked(effect.written(), effect.verdict in ('helps', 'harms'))}, {worse}/{len(changes)}"
+    figure = of_scenes[0].figure
+    pairs = PairedDifference(figure, tuple(change for scene in of_scenes for change in scene.each))
+    worse = sum(figure.better * change < 0 for change in pairs.each)
+    return f"{_marked(pairs.written(), over_sequences(of_scenes).stands_out)}, {worse}/{len(pairs.each)}"
 
 
 def _marked(text: str, stands_out: bool) -> str:

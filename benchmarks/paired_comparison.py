@@ -1,9 +1,14 @@
-"""Compare runs that differ in one setting, at equal seeds: mean and spread of the differences, and a verdict."""
+"""Compare runs that differ in one setting, at equal seeds: mean and spread of the differences, and a verdict.
+
+There is one test, `judge`: does the 95 % t interval of a mean exclude 0? Its values are the differences at equal seeds,
+for a verdict on one sequence, or the mean differences of several sequences, for one over them (`over_sequences`).
+"""
 
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 from scipy.stats import t as student
@@ -12,7 +17,11 @@ from sigmasplat.run.figures import number
 
 Run = Mapping[str, Any]
 """A run as the file of an ablation stores it: `variant`, `seed`, and `figures` by name, None for a missing value."""
-Verdict = Literal["helps", "harms", "within the spread", "unknown"]
+Verdict = Literal["helps", "harms", "no clear effect", "not tested"]
+CHANCE = 0.05
+"""How often a change without any effect is called one, at most."""
+RATIO_UNITS = ("cm", "mm", "°", "k", "ms")
+"""Units of figures that are compared in percent over sequences: a centimetre is much on one and little on another."""
 
 
 @dataclass(frozen=True)
@@ -116,30 +125,72 @@ def rows(
     return laid_out
 
 
+@cache
+def t_limit(count: int, chance: float) -> float:
+    """Return the |t| that a mean of `count` normal values without effect exceeds with this probability."""
+    return float(student.ppf(1 - chance / 2, count - 1))
+
+
+def interval(values: Sequence[float], chance: float = CHANCE) -> tuple[float, float] | None:
+    """Return the t interval of the mean, which misses the true mean with probability `chance`; None for one value."""
+    if len(values) < 2:
+        return None
+    mean, error = statistics.fmean(values), statistics.stdev(values) / math.sqrt(len(values))
+    half = t_limit(len(values), chance) * error
+    return mean - half, mean + half
+
+
+def judge(values: Sequence[float], better: int, chance: float = CHANCE) -> Verdict:
+    """Return whether differences show an effect: whether the interval of their mean excludes 0. better: +1 or −1."""
+    found = interval(values, chance)
+    if found is None:
+        return "not tested"
+    low, high = sorted(better * end for end in found)
+    return "helps" if low > 0 else "harms" if high < 0 else "no clear effect"
+
+
 @dataclass(frozen=True)
 class PairedDifference:
-    """How a change affects a figure: mean and standard deviation of the differences at equal seeds, in its unit.
+    """How a change affects a figure: its differences, in its unit, at each seed that both have, or of each sequence.
 
     Runs with the same seed see the same scene and random numbers, so what these contribute cancels in the difference.
+    level: mean of the figure without the change.
     """
 
     figure: Figure
-    mean: float
-    deviation: float | None
+    each: tuple[float, ...]
+    level: float | None = None
+
+    @property
+    def mean(self) -> float:
+        """Return the mean difference."""
+        return statistics.fmean(self.each)
+
+    @property
+    def deviation(self) -> float | None:
+        """Return the sample standard deviation of the differences, None for a single one."""
+        return deviation(self.each)
 
     @property
     def unchanged(self) -> bool:
         """Return whether the figure is the same in every run."""
-        return self.mean == 0 and not self.deviation
+        return not any(self.each)
 
     @property
     def verdict(self) -> Verdict:
-        """Compare the mean with one standard deviation; "unknown" for a single seed."""
-        if self.deviation is None:
-            return "unknown"
-        if abs(self.mean) <= self.deviation:
-            return "within the spread"
-        return "helps" if self.mean * self.figure.better > 0 else "harms"
+        """Judge the differences; none is clear that its figure's digits do not show."""
+        return self.judged()
+
+    def judged(self, chance: float = CHANCE) -> Verdict:
+        """Judge the differences at another probability of being called an effect by chance."""
+        found = judge(self.each, self.figure.better, chance)
+        hidden = round(self.mean, self.figure.digits) == 0
+        return "no clear effect" if found in ("helps", "harms") and hidden else found
+
+    @property
+    def stands_out(self) -> bool:
+        """Return whether the differences show an effect."""
+        return self.verdict in ("helps", "harms")
 
     def written(self) -> str:
         """Format the difference with its sign, ± standard deviation and unit; only 0 if nothing changed."""
@@ -150,15 +201,34 @@ class PairedDifference:
         return f"{sign}{number(self.mean, self.figure.digits)}{std} {self.figure.unit}".rstrip()
 
 
+def difference(runs: Sequence[Run], changed: str, against: str, figure: Figure) -> PairedDifference | None:
+    """Return how one variant differs from another in a figure, over the seeds that both have; None without any."""
+    base, other = by_seed(runs, against, figure), by_seed(runs, changed, figure)
+    seeds = [seed for seed in base if seed in other]
+    if not seeds:
+        return None
+    level = statistics.fmean(base[seed] for seed in seeds)
+    return PairedDifference(figure, tuple(other[seed] - base[seed] for seed in seeds), level)
+
+
 def paired_differences(runs: Sequence[Run], changed: str, against: str) -> list[PairedDifference]:
     """Return how one variant differs from another in each judged figure, over the seeds that both have."""
-    found = []
-    for figure in (figure for figure in columns(runs) if figure.judged):
-        base, other = by_seed(runs, against, figure), by_seed(runs, changed, figure)
-        differences = [other[seed] - base[seed] for seed in base if seed in other]
-        if differences:
-            found.append(PairedDifference(figure, statistics.fmean(differences), deviation(differences)))
-    return found
+    judged = (figure for figure in columns(runs) if figure.judged)
+    return [found for figure in judged if (found := difference(runs, changed, against, figure)) is not None]
+
+
+def over_sequences(found: Sequence[PairedDifference]) -> PairedDifference:
+    """Return the mean differences of several sequences as one: each counts once, whatever its number of seeds.
+
+    A sequence may have its own noise, and an effect of its own that more seeds do not remove; then the t test of the
+    sequences' means is right, that of all seeds is not (Ibragimov and Müller 2010). Lengths, angles, times and numbers
+    of splats are compared in percent of the value without the change.
+    """
+    figure, levels = found[0].figure, [difference.level for difference in found]
+    if figure.unit not in RATIO_UNITS or not all(levels):
+        return PairedDifference(figure, tuple(difference.mean for difference in found))
+    each = tuple(100 * difference.mean / level for difference, level in zip(found, levels, strict=True) if level)
+    return PairedDifference(replace(figure, unit="%", digits=1), each)
 
 
 def described(found: Sequence[PairedDifference]) -> str:
@@ -173,21 +243,13 @@ def described(found: Sequence[PairedDifference]) -> str:
     for verdict in ("helps", "harms"):
         named = [f"{e.figure.title} ({e.written()})" for e in found if e.verdict == verdict]
         parts += [f"{verdict} {joined(named)}"] if named else []
-    rest = [e.figure.title for e in found if e.verdict == "within the spread"]
+    rest = [e.figure.title for e in found if e.verdict == "no clear effect"]
     if rest:
         where = f" on {joined(rest)}" if parts else ""
-        parts.append(f"no effect beyond the spread over seeds{where}")
+        parts.append(f"no clear effect{where}")
     return "; ".join(parts)
 
 
 def joined(words: Sequence[str]) -> str:
     """Join words as in: a, b and c."""
     return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
-
-
-def passed_by_chance(seeds: int) -> float:
-    """Return the probability that a change without effect is judged to have one: |mean| > one sample deviation.
-
-    Differences are assumed to be normally distributed.
-    """
-    return float(2 * student.sf(math.sqrt(seeds), seeds - 1))

@@ -1,9 +1,9 @@
 """Run the presets of both papers with their own numbers of iterations on real frames with several submaps (issue 18).
 
 Nothing is shortened: tracking, mapping, registration and the final map take all their steps. The images are 160 pixels
-wide, so the pixels cropped at each edge are scaled down too. Every 8th frame is held out. `sigma`, the default, runs on
-the same frames. Writes benchmarks/results/paper-presets-<machine>.json and prints a table for each sequence; exit code
-1 if a run failed.
+wide, those of light presets 80, and the pixels cropped at each edge are scaled down too. Every 8th frame is held out.
+`sigma`, the default, runs on the same frames. Writes benchmarks/results/paper-presets-<machine>.json and prints a table
+for each sequence; exit code 1 if a run failed.
 
 example: python benchmarks/paper_presets.py --sources redkitchen --presets cgslam-tum sigma
 """
@@ -33,6 +33,7 @@ WIDTH_PX = 160
 CAMERA_WIDTH_PX = 640
 """Width of the images of both sequences, to which the presets' cropped pixels refer."""
 HOLD_OUT = 8
+LIGHT = "-light-"
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,13 @@ class Options(accuracy.Options):
 
 
 def sized(preset: str) -> tuple[str, ...]:
-    """Return the settings that a run of a preset differs in, as of --set: size, scaled crop, held-out frames."""
+    """Return the settings that a run of a preset differs in, as of --set: size, scaled crop, held-out frames.
+
+    A light preset is another one at half the size, and nothing else.
+    """
+    width_px = WIDTH_PX // 2 if LIGHT in preset else WIDTH_PX
     crop_px = preset_of(preset).input.crop_px * WIDTH_PX // CAMERA_WIDTH_PX
-    return (f"input.width={WIDTH_PX}", f"input.crop_px={crop_px}", f"input.hold_every={HOLD_OUT}")
+    return (f"input.width={width_px}", f"input.crop_px={crop_px}", f"input.hold_every={HOLD_OUT}")
 
 
 def with_times(job: accuracy.Job, result: dict[str, Any], options: Options) -> dict[str, Any]:
@@ -100,7 +105,13 @@ def sections(measured: dict[str, Any]) -> list[Section]:
         rows = []
         for name in dict.fromkeys(run["job"]["preset"] for run in runs):
             same = [run for run in runs if run["job"]["preset"] == name]
-            rows.append([name, *(spread([k * v for v in values_of(same, figure)]) for _, figure, k in COLUMNS)])
+            full_size = LIGHT in name and any(f"input.width={WIDTH_PX}" in run["job"]["settings"] for run in same)
+            rows.append(
+                [
+                    f"{name} (not light: full size)" if full_size else name,
+                    *(spread([k * v for v in values_of(same, figure)]) for _, figure, k in COLUMNS),
+                ]
+            )
         frames = int(runs[0]["figures"]["frames"]) if runs else 0
         made.append(Section(source, ["preset", *(t for t, _, _ in COLUMNS)], rows, f"{frames} frames. {NOTE}"))
     return [section for section in [*made, failures(results)] if section.rows]

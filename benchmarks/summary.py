@@ -12,7 +12,6 @@ import claims_tables
 import record
 import tables
 from ablation import verdict_counts
-from paired_comparison import passed_by_chance
 from result_pages import link
 
 SEQUENCES = ("livingroom", "synthetic", "redkitchen")
@@ -45,33 +44,31 @@ class Results:
 
 
 def weights_of_variance(results: Results) -> str:
-    """Count the figures that the weights of σ² improve."""
+    """Count the figures that the weights of σ² change over the sequences."""
     measured = results.measured("ablation")
     earlier = verdict_counts(measured, "+registration", "none")
     final = verdict_counts(measured, "+final", "+registration")
-    chance = passed_by_chance(len(measured["seeds"]))
     return (
-        f"**mostly within one deviation**: with σ² in tracking, loops and registration {earlier['helps']} of "
-        f"{earlier.total()} figures are better, {earlier['harms']} worse, {earlier['within the spread']} within one "
-        f"standard deviation ({chance:.0%} lie beyond it by chance); with σ² in the final map too {final['helps']} "
+        f"with σ² in tracking, loops and registration {earlier['helps']} of {earlier.total()} figures are better, "
+        f"{earlier['harms']} worse, the others without clear effect; with σ² in the final map too {final['helps']} "
         f"better, {final['harms']} worse of {final.total()}"
     )
 
 
 def uses_of_uncertainty(results: Results) -> str:
-    """Name the uses of an uncertainty that help on several sequences, and those that hurt."""
+    """Name the uses of an uncertainty that help or harm over the sequences."""
     (verdicts,) = (s for s in tables.sections(results.measured("weights")) if s.title == "Verdicts")
-    by = {word: [row[0] for row in verdicts.rows if row[1] == word] for word in ("helps", "hurts")}
+    by = {word: [row[0] for row in verdicts.rows if row[1] == word] for word in ("helps", "harms", "mixed")}
     named = "; ".join(f"{word}: {', '.join(found) or '–'}" for word, found in by.items())
-    return f"of {len(verdicts.rows)} changes, {named}; the others differ by sequence or have no effect"
+    return f"of {len(verdicts.rows)} changes, {named}; the others have no clear effect"
 
 
 def claims(results: Results) -> str:
     """Count the verdicts on the claims of each paper."""
     counts = {paper: claims_tables.verdict_counts(paper, results.folder) for paper in claims_tables.PAPERS}
     return "; ".join(
-        f"{paper}: {count['reproduced']} of {count.total()} reproduced, {count[claims_tables.NOT_MEASURABLE]} not "
-        "measurable here"
+        f"{paper}: {count[claims_tables.HOLDS]} of {count.total()} hold, {count[claims_tables.OPPOSITE]} show the "
+        f"opposite, {count[claims_tables.UNCLEAR]} no clear effect, the others could not be tested"
         for paper, count in counts.items()
     )
 

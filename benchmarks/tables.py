@@ -3,7 +3,8 @@
 result_pages.py says what each page shows. A document holds <!-- bench:NAME --> … <!-- /bench -->, or bench:NAME/SECTION
 for one table of several; `python benchmarks/tables.py` replaces the text between them. NAME is the name of results (the
 newest from any machine) or a file name without .json; SECTION is the title of a table, as in path-and-speed.
-bench:pages lists the pages, bench:summary is the table of summary.py, bench:verdicts that of claims_tables.py.
+bench:pages lists the pages, bench:summary is the table of summary.py, bench:verdicts and bench:held are of
+claims_tables.py.
 """
 
 import importlib
@@ -133,7 +134,15 @@ def verdicts(folder: Path = record.RESULTS) -> str:
     return made
 
 
-WHOLE: dict[str, Callable[[Path], str]] = {"pages": list_of_pages, "summary": summary, "verdicts": verdicts}
+def held(folder: Path = record.RESULTS) -> str:
+    """Write the lists of the claims that hold, do not, or could not be tested. Raises KeyError if it lacks a result."""
+    made: str = importlib.import_module("claims_tables").lists(folder)
+    return made
+
+
+WHOLE: dict[str, Callable[[Path], str]] = {
+    "pages": list_of_pages, "summary": summary, "verdicts": verdicts, "held": held,
+}  # fmt: skip
 """Blocks that show more than the results of one name."""
 
 

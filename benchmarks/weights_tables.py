@@ -1,18 +1,10 @@
 """Tabulate the results of weights.py: values, differences at equal seeds, and verdicts over all sequences."""
 
-import statistics
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from paired_comparison import (
-    Figure,
-    PairedDifference,
-    by_seed,
-    deviation,
-    passed_by_chance,
-    rows,
-)
+from paired_comparison import CHANCE, Figure, PairedDifference, difference, over_sequences, rows
 from tables import Section
 from weights import DEFAULT
 
@@ -91,36 +83,23 @@ def of(runs: Runs, group: str, source: str) -> Runs:
     return [run for run in runs if run["group"] == group and run["source"] == source]
 
 
-def difference(runs: Runs, change: Change, figure: Figure) -> PairedDifference | None:
-    """Return the paired difference of a change on one sequence; None without seeds that both variants have."""
-    changed, against = by_seed(runs, change.changed, figure), by_seed(runs, change.against, figure)
-    found = [changed[seed] - against[seed] for seed in against if seed in changed]
-    return PairedDifference(figure, statistics.fmean(found), deviation(found)) if found else None
-
-
 def verdicts(runs: Runs) -> Section:
-    """List where each change makes figures better or worse beyond the seeds, and a verdict."""
+    """List the figures that each change makes better or worse over the sequences, and a verdict."""
     laid_out = []
     for change in CHANGES:
-        found = found_of(runs, change)
+        found = pooled(runs, change)
         if found:
-            better, worse = (
-                {s: names for s, names in by.items() if names} for by in (named(found, "helps"), named(found, "harms"))
-            )
-            cells = [
-                "; ".join(f"{source}: {', '.join(names)}" for source, names in by.items()) for by in (better, worse)
-            ]
-            judged = judgement(better, worse, len(found))
-            laid_out.append([change.what, judged, f"{common_seeds(runs, change)}", *(cell or "–" for cell in cells)])
-    seeds = len({run["seed"] for run in runs})
+            by = {word: [d for d in found if d.judged(CHANCE / len(found)) == word] for word in ("helps", "harms")}
+            cells = ["; ".join(f"{d.figure.title} ({d.written()})" for d in by[word]) or "–" for word in by]
+            laid_out.append([change.what, judgement(found), f"{common_seeds(runs, change)}", *cells])
     note = (
-        "Beyond the seeds: the mean of the differences at equal seeds exceeds their standard deviation; "
-        f"{passed_by_chance(seeds):.0%} of figures do so by chance. *helps*: at least a fifth of all figures, on at "
-        "least two sequences, are better beyond the seeds, and at most a quarter as many are worse; *hurts*: the "
-        "opposite. Otherwise *no effect* if at most a quarter of all figures differ beyond the seeds, else *mixed*."
+        "A figure is better or worse if the t interval of the sequences' mean differences excludes 0, at "
+        f"{100 * (1 - CHANCE):.0f} % for all figures of a change together (Bonferroni): a change without any effect is "
+        f"called one in at most {CHANCE:.0%} of cases. Lengths and angles are compared in percent. *mixed*: better and "
+        "worse."
     )
-    head = ["change", "verdict", "seeds", "better beyond the seeds", "worse beyond the seeds"]
-    return Section("Verdicts", head, laid_out, note if seeds > 1 else "")
+    head = ["change", "verdict", "seeds", "better", "worse"]
+    return Section("Verdicts", head, laid_out, note if len(sources_of(runs)) > 1 else "")
 
 
 def common_seeds(runs: Runs, change: Change) -> int:
@@ -131,78 +110,59 @@ def common_seeds(runs: Runs, change: Change) -> int:
     return min(sum(source == s for s, _ in both) for source in {s for s, _ in both})
 
 
-def found_of(runs: Runs, change: Change) -> list[tuple[str, PairedDifference]]:
-    """Return the paired differences of a change with their sequences, over all judged figures."""
-    judged = [figure for figure in FIGURES[change.group] if figure.judged]
-    pairs = ((s, difference(of(runs, change.group, s), change, figure)) for s in sources_of(runs) for figure in judged)
-    return [(source, found) for source, found in pairs if found]
+def pooled(runs: Runs, change: Change) -> list[PairedDifference]:
+    """Return how a change affects each judged figure over the sequences that have it."""
+    of_figures = (of_sequences(runs, change, figure) for figure in FIGURES[change.group] if figure.judged)
+    return [over_sequences(found) for found in of_figures if len(found) > 1]
 
 
-def named(found: Sequence[tuple[str, PairedDifference]], verdict: str) -> dict[str, list[str]]:
-    """Return the titles of the figures with a verdict, by sequence."""
-    return {
-        source: [d.figure.title for s, d in found if s == source and d.verdict == verdict]
-        for source in dict.fromkeys(source for source, _ in found)
-    }
+def of_sequences(runs: Runs, change: Change, figure: Figure) -> list[PairedDifference]:
+    """Return how a change affects a figure, sequence by sequence."""
+    found = (
+        difference(of(runs, change.group, source), change.changed, change.against, figure)
+        for source in sources_of(runs)
+    )
+    return [of_sequence for of_sequence in found if of_sequence is not None]
 
 
-def judgement(better: Mapping[str, Sequence[str]], worse: Mapping[str, Sequence[str]], compared: int) -> str:
-    """Return the verdict on a change from the figures that it makes better and worse, by sequence; compared: the number
-    of all figures."""
-    gains, losses = (sum(map(len, by.values())) for by in (better, worse))
-    if len(better) > 1 and 5 * gains >= compared and 4 * losses <= gains:
-        return "helps"
-    if len(worse) > 1 and 5 * losses >= compared and 4 * gains <= losses:
-        return "hurts"
-    return "no effect" if 4 * (gains + losses) <= compared else "mixed"
+def judgement(found: Sequence[PairedDifference]) -> str:
+    """Return the verdict on a change from its figures over the sequences, each judged at its share of `CHANCE`."""
+    verdicts = {difference.judged(CHANCE / len(found)) for difference in found}
+    if {"helps", "harms"} <= verdicts:
+        return "mixed"
+    return next((word for word in ("helps", "harms") if word in verdicts), "no clear effect")
 
 
 def mean_of_sequences(runs: Runs, group: str) -> Section:
     """Tabulate the mean of the differences over the sequences, in percent of the value without the change."""
     judged, laid_out = [figure for figure in FIGURES[group] if figure.judged], list[list[str]]()
     for change in (change for change in CHANGES if change.group == group):
-        found = [[relative(of(runs, group, source), change, f) for source in sources_of(runs)] for f in judged]
-        known = [[value for value in values if value is not None] for values in found]
-        if any(known):
-            laid_out.append([change.what, *map(pooled, judged, known)])
-    note = "Mean ± standard deviation over the sequences of the mean differences; bold: larger than one deviation."
+        found = [of_sequences(runs, change, figure) for figure in judged]
+        if any(found):
+            laid_out.append([change.what, *(written(over_sequences(of) if of else None) for of in found)])
+    note = "Mean ± standard deviation over the sequences of the mean differences; bold: its 95 % t interval excludes 0."
     return Section(f"{TITLES[group]}, mean of sequences", ["change", *(f.title for f in judged)], laid_out, note)
 
 
-def relative(runs: Runs, change: Change, figure: Figure) -> float | None:
-    """Return the mean difference of a change in percent of the mean before; decibels as they are."""
-    found, before = difference(runs, change, figure), list(by_seed(runs, change.against, figure).values())
-    if found is None or figure.unit == "dB":
-        return None if found is None else found.mean
-    level = statistics.fmean(before)
-    return 100.0 * found.mean / level if level else None
-
-
-def pooled(figure: Figure, values: Sequence[float]) -> str:
-    """Format mean ± standard deviation over the sequences; bold if the mean is larger."""
-    unit = figure.unit if figure.unit == "dB" else "%"
-    shown = replace(figure, unit=unit, digits=2 if unit == "dB" else 1)
-    return written(PairedDifference(shown, statistics.fmean(values), deviation(values)) if values else None)
-
-
 def differences(runs: Runs, group: str) -> Section:
-    """Tabulate the differences at equal seeds of one kind; those beyond the seeds are bold."""
+    """Tabulate the differences at equal seeds of one kind; those that show an effect are bold."""
     judged, laid_out = [figure for figure in FIGURES[group] if figure.judged], []
     for change in (change for change in CHANGES if change.group == group):
         for source in sources_of(runs):
-            found = [difference(of(runs, group, source), change, figure) for figure in judged]
+            here = of(runs, group, source)
+            found = [difference(here, change.changed, change.against, figure) for figure in judged]
             if any(found):
                 laid_out.append([change.what, source, *map(written, found)])
-    note = "Mean ± standard deviation of the differences at equal seeds; bold: beyond the seeds."
+    note = "Mean ± standard deviation of the differences at equal seeds; bold: their 95 % t interval excludes 0."
     title = f"{TITLES[group]}, differences"
     return Section(title, ["change", "sequence", *(figure.title for figure in judged)], laid_out, note)
 
 
 def written(found: PairedDifference | None) -> str:
-    """Format a difference; bold if it is beyond the seeds, a dash without one."""
+    """Format a difference; bold if it shows an effect, a dash without one."""
     if found is None:
         return "–"
-    return f"**{found.written()}**" if found.verdict in ("helps", "harms") else found.written()
+    return f"**{found.written()}**" if found.stands_out else found.written()
 
 
 def values(runs: Runs, group: str, source: str) -> Section:

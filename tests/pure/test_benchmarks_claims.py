@@ -4,10 +4,12 @@ import importlib
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from paired_comparison import Figure, PairedDifference
 
 from benchmark_results import laid_out, results
+from sigmasplat.config.find_preset import preset
 from sigmasplat.errors import ConfigError
 
 claims, evidence, tables, record = map(
@@ -18,13 +20,13 @@ ERROR, SCORE = Figure("error", "error", "cm", -1), Figure("score", "score", "", 
 
 def claim(claimed: str, figure: Figure = ERROR, against: str | None = "without") -> Any:
     """Return a claim on what "with" changes."""
-    found = evidence.Evidence("made-up", evidence.of_runs, figure, "with", against)
+    found = evidence.Evidence("made-up", evidence.of_runs, figure, "with", against, "sigma")
     return evidence.Claim("it helps", "a number", claimed, found)
 
 
-def differences(*pairs: tuple[float, float], figure: Figure = ERROR) -> list[PairedDifference]:
-    """Return differences by mean and deviation."""
-    return [PairedDifference(figure, mean, deviation) for mean, deviation in pairs]
+def differences(*means: float, figure: Figure = ERROR) -> list[PairedDifference]:
+    """Return the differences of sequences with these means; without a change the figure is 100."""
+    return [PairedDifference(figure, (mean - 0.1, mean, mean + 0.1), 100.0) for mean in means]
 
 
 def write(folder: Path, runs: list[tuple[str, str, int, float]], figure: str = "error") -> None:
@@ -69,53 +71,91 @@ def test_weights_of_both_papers_track_by_descent_through_the_renderer() -> None:
 @pytest.mark.parametrize(
     ("claimed", "found", "verdict"),
     [
-        ("less", [(-2.0, 1.0), (-2.0, 1.0), (2.0, 1.0)], "reproduced"),
-        ("less", [(-2.0, 1.0), (-0.5, 1.0), (-0.5, 1.0)], "not reproduced"),
-        ("less", [(-2.0, 1.0), (-0.5, 1.0)], "not reproduced"),
-        ("less", [(2.0, 1.0), (2.0, 1.0), (-0.5, 1.0)], "the opposite"),
-        ("more", [(2.0, 1.0), (2.0, 1.0), (-0.5, 1.0)], "reproduced"),
-        ("less", [(0.0, 0.0)], "not reproduced"),
-        ("no worse", [(0.5, 1.0), (-2.0, 1.0), (2.0, 1.0)], "reproduced"),
-        ("no worse", [(2.0, 1.0), (2.0, 1.0), (-0.5, 1.0)], "the opposite"),
-        ("less", [], "not measured yet"),
+        ("less", (-2.0, -2.5, -1.5), "holds"),
+        ("less", (2.0, 2.5, 1.5), "the opposite"),
+        ("more", (2.0, 2.5, 1.5), "holds"),
+        ("less", (-2.0, -2.5, 1.5), "no clear effect"),
+        ("less", (-2.0, -0.1), "no clear effect"),
+        ("less", (0.0, 0.0), "no clear effect"),
+        ("less", (-2.0,), "one sequence only: not tested"),
+        ("no worse", (0.0, 1.0, -1.0), "holds"),
+        ("no worse", (2.0, 2.5, 1.5), "holds"),
+        ("no worse", (20.0, 25.0, 15.0), "the opposite"),
+        ("no worse", (3.0, 0.0, -1.0), "no clear effect"),
     ],
 )
-def test_a_claim_is_reproduced_if_most_sequences_show_it_beyond_one_deviation(
-    claimed: str, found: list[tuple[float, float]], verdict: str
+def test_a_claim_holds_if_the_interval_over_sequences_lies_on_its_side(
+    claimed: str, found: tuple[float, ...], verdict: str
 ) -> None:
+    """An error may be 5 % larger and still not be worse."""
     assert tables.verdict(claim(claimed), differences(*found)) == verdict
 
 
 def test_not_worse_depends_on_which_direction_is_better() -> None:
-    lower = differences((-2.0, 1.0), figure=SCORE)
-    assert tables.verdict(claim("no worse", SCORE), lower) == "the opposite"
-    assert tables.verdict(claim("no worse"), differences((-2.0, 1.0))) == "reproduced"
+    psnr = Figure("psnr", "PSNR", "dB", +1)
+    lower = differences(-2.0, -2.5, -1.5, figure=psnr)
+    assert tables.verdict(claim("no worse", psnr), lower) == "the opposite"
+    assert tables.verdict(claim("no worse"), differences(-2.0, -2.5, -1.5)) == "holds"
+
+
+@pytest.mark.parametrize("claimed", ["less", "more", "no worse"])
+def test_pure_noise_is_a_verdict_in_five_percent_of_cases(claimed: str) -> None:
+    """2 to 6 sequences, each with its own noise over 3 to 5 seeds and its own shift, which no seed shows. For "no
+    worse" the truth is the margin itself: an error 5 % larger."""
+    rng, draws, wrong = np.random.default_rng(1), 4000, 0
+    for _ in range(draws):
+        made = []
+        for scale in 10 ** rng.uniform(-1, 1, rng.integers(2, 7)):
+            shift = rng.normal(5.0 if claimed == "no worse" else 0.0, scale)
+            made.append(PairedDifference(ERROR, tuple(rng.normal(shift, scale, rng.integers(3, 6))), 100.0))
+        found = tables.verdict(claim(claimed), made)
+        wrong += found == "holds" if claimed == "no worse" else found != "no clear effect"
+    assert wrong / draws <= 0.05 + 3 * (0.05 * 0.95 / draws) ** 0.5
+
+
+def test_pure_noise_is_an_effect_in_five_percent_of_tables() -> None:
+    """On one sequence, of the seeds; in weights.py, of all figures of a change together."""
+    rng, draws, names = np.random.default_rng(2), 2000, "abcdefg"
+    noise = rng.normal(size=(draws, 5, len(names)))
+    found = [
+        [PairedDifference(Figure(name, name, "dB", +1, digits=9), tuple(of[:, k])) for k, name in enumerate(names)]
+        for of in noise
+    ]
+    limit = 0.05 + 3 * (0.05 * 0.95 / draws) ** 0.5
+    assert sum(differences[0].stands_out for differences in found) / draws <= limit
+    judgement = importlib.import_module("weights_tables").judgement
+    assert sum(judgement(differences) != "no clear effect" for differences in found) / draws <= limit
 
 
 def test_a_row_holds_differences_at_equal_seeds_and_where_they_lie(tmp_path: Path) -> None:
-    write(tmp_path, pairs("kitchen", -1.0, -2.0, -3.0) + pairs("hall", 1.0, -1.0, 0.3) + pairs("few", -5.0, -5.1))
-    said, published, text, judged, provenance = tables.row(claim("less"), tmp_path)
-    assert (said, published) == ("it helps", "a number")
-    assert "kitchen **−2.00 ± 1.00**" in text and "hall +0.10 ± 1.01" in text and "few" not in text
-    assert judged == "**not reproduced**: as claimed on 1 of 2"
+    write(tmp_path, pairs("kitchen", -1.0, -1.2, -0.8) + pairs("hall", 1.0, -1.0, 0.3) + pairs("few", -5.0, -5.1))
+    said, published, settings, text, interval, judged, provenance = tables.row(claim("less"), tmp_path)
+    assert (said, published, settings) == ("it helps", "a number", "other: `sigma`")
+    assert "kitchen **−1.00±0.20**" in text and "hall +0.10±1.01" in text
+    assert judged == "**no clear effect**" and interval.startswith("−4.1 [") and interval.endswith("] %")
     assert "3 seeds" in provenance and "0123456789ab"[:9] in provenance
+    few = tmp_path / "few"
+    write(few, pairs("kitchen", -1.0, -1.2) + pairs("hall", 1.0, -1.0))
+    assert tables.row(claim("less"), few)[5] == "**fewer than 3 seeds: not tested**"
 
 
 def test_a_figure_itself_is_compared_with_zero(tmp_path: Path) -> None:
-    write(tmp_path, [("kitchen", "with", seed, 0.5 + 0.1 * seed) for seed in range(3)], "score")
-    assert "**reproduced**: as claimed on 1 of 1" in tables.row(claim("more", SCORE, None), tmp_path)
+    runs = [(source, "with", seed, 0.5 + 0.1 * seed) for source in ("kitchen", "hall") for seed in range(3)]
+    write(tmp_path, runs, "score")
+    assert tables.row(claim("more", SCORE, None), tmp_path)[4:6] == ["0.60 [0.60, 0.60]", "**holds**"]
 
 
 def test_figures_that_are_zero_in_all_runs_show_nothing(tmp_path: Path) -> None:
     write(tmp_path, [("kitchen", variant, seed, 0.0) for variant in ("with", "without") for seed in range(3)])
-    assert tables.judged(claim("less"), tmp_path) == (tables.NOT_MEASURABLE, {})
+    assert tables.judged(claim("less"), tmp_path)[0] == tables.NOT_MEASURABLE
+    assert tables.row(claim("less"), tmp_path)[3] == "error: 0 in all runs"
 
 
 def test_missing_results_are_named_and_missing_evidence_has_a_reason(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="made-up"):
         tables.row(claim("less"), tmp_path)
     unmeasured = evidence.Claim("it is fast", "a number", "less", None, "no GPU")
-    assert tables.row(unmeasured, tmp_path)[2:4] == ["– (no GPU)", tables.NOT_MEASURABLE]
+    assert tables.row(unmeasured, tmp_path)[3:6] == ["– (no GPU)", "–", tables.NOT_MEASURABLE]
 
 
 def test_every_claim_names_variants_that_are_measured() -> None:
@@ -128,6 +168,31 @@ def test_every_claim_names_variants_that_are_measured() -> None:
         else:
             verdict, found = tables.judged(listed, record.RESULTS)
             assert found or verdict == tables.NOT_MEASURABLE, listed.said
+
+
+def test_every_row_has_a_family_and_a_verdict_and_none_rests_on_one_sequence() -> None:
+    for paper, listed in tables.PAPERS.items():
+        for one in listed:
+            row = tables.row(one, record.RESULTS)
+            verdict, found = tables.judged(one, record.RESULTS)
+            assert one.evidence is None or row[2] == "the paper's own" or row[2].startswith("other: `"), (paper, row)
+            tested = verdict in (tables.HOLDS, tables.OPPOSITE, tables.UNCLEAR)
+            assert not tested or len(tables.counting(found)) > 1, row
+
+
+def test_the_papers_own_settings_replace_the_small_ones() -> None:
+    for small, own in claims.OWN.items():
+        for job in claims.jobs_of(claims.Options(groups=(own,), seeds=(0,))):
+            paper, config = preset(claims.GROUPS[own].preset), job.config()
+            assert config.input.width == 320 and config.tracking.iterations == paper.tracking.iterations
+            for name in ("iterations", "first_iterations", "every", "lr_means", "lr_log_variances"):
+                assert getattr(config.mapping, name) == getattr(paper.mapping, name)
+            assert (config.tracking.lr_rotation, config.tracking.method) == (paper.tracking.lr_rotation, "adam")
+        papers = importlib.import_module("claims_papers")
+        one = papers.in_claims(small, papers.ATE, *list(claims.GROUPS[own].variants)[:2])
+        runs = {"figures": {"runs": [{"group": small}, {"group": own}]}}
+        assert one.family(runs) == "the paper's own" and [run["group"] for run in one.read(runs)] == [own]
+        assert one.family({"figures": {"runs": [{"group": small}]}}).startswith("other")
 
 
 def test_values_are_tabulated_by_kind_and_sequence() -> None:

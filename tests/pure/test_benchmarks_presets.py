@@ -15,6 +15,7 @@ from sigmasplat.run_folder.runs import RunFolder
 
 accuracy = importlib.import_module("accuracy")
 every_preset = importlib.import_module("every_preset")
+paper_presets = importlib.import_module("paper_presets")
 
 
 @pytest.mark.parametrize("name", every_preset.EVERY)
@@ -63,6 +64,24 @@ def test_a_collection_has_the_runs_that_ended_and_runs_nothing(
     said = capsys.readouterr()
     assert "2 of 4 runs" in said.err and "varsplat-fast" in said.out and "no list of splats" in said.out
     assert "loopsplat-fast" not in said.out and "cgslam-fast" not in said.out
+
+
+def test_a_light_preset_runs_at_half_the_size_of_the_other() -> None:
+    full, light = (
+        override(preset(name), split_settings(paper_presets.sized(name))) for name in ("cgslam-tum", "cgslam-light-tum")
+    )
+    assert (full.input.width, light.input.width) == (160, 80)
+    assert full == light.changed(input={"width": 160})
+
+    def result(name: str, width_px: int) -> dict[str, Any]:
+        job = {"source": "kitchen", "preset": name, "settings": [f"input.width={width_px}"]}
+        return {"job": job, "problem": None, "figures": {"frames": 120, "ate_m": 0.02}}
+
+    results = [result("cgslam-light-tum", 160), result("cgslam-light-replica", 80), result("cgslam-tum", 160)]
+    shown = laid_out("paper_presets", {"jobs": results})["kitchen"]
+    assert [row[0] for row in shown.rows] == [
+        "cgslam-light-tum (not light: full size)", "cgslam-light-replica", "cgslam-tum",
+    ]  # fmt: skip
 
 
 def test_both_rules_are_judged_by_the_errors_where_they_fire() -> None:
