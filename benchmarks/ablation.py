@@ -215,19 +215,18 @@ def effects_of(by_source: dict[str, Runs], seeds: int) -> Section:
 
 
 def verdicts(by_source: dict[str, Runs]) -> Section:
-    """List the figures that each change helps or harms over the sequences, and those without a clear effect."""
+    """List the figures that each change helps or harms over the sequences; it has no clear effect on the others."""
     laid_out = []
     for changed, against in dict.fromkeys(pair for runs in by_source.values() for pair in compared(runs)):
-        by: dict[str, list[str]] = {"helps": [], "harms": [], "no clear effect": []}
-        for effect in pooled([*by_source.values()], changed, against):
-            shown = "" if effect.verdict == "no clear effect" else f" ({effect.written()})"
-            by[effect.verdict].append(effect.figure.title + shown)
-        laid_out.append([f"{changed} against {against}", *(", ".join(names) or "–" for names in by.values())])
+        effects = pooled([*by_source.values()], changed, against)
+        by = [[e for e in effects if e.verdict == word] for word in ("helps", "harms")]
+        cells = [", ".join(f"{e.figure.title} ({e.written()})" for e in found) or "–" for found in by]
+        laid_out.append([f"{changed} against {against}", *cells])
     note = (
         f"Over {len(by_source)} sequences: *helps*, *harms* if the 95 % t interval of the sequences' mean differences "
-        f"excludes 0; {CHANCE:.0%} of figures do so by chance. Lengths are compared in percent."
+        f"excludes 0; {CHANCE:.0%} of figures do so by chance. No clear effect on all others."
     )
-    return Section("Verdicts", ["change", "helps", "harms", "no clear effect"], laid_out, note)
+    return Section("Verdicts", ["change", "helps", "harms"], laid_out, note)
 
 
 def pooled(by_source: Sequence[Runs], changed: str, against: str) -> list[PairedDifference]:

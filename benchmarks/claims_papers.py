@@ -65,13 +65,13 @@ def in_scenes(figure: Figure, without: str) -> Evidence:
     return Evidence("consistency", of_scenes, figure, "full", without, "cgslam-fast")
 
 
-NO_NUMBER = "no number"
+NO_NUMBER = "–"
 NO_DATA = "`sigmasplat bench table {}`, where the data is"
 VARSPLAT = (
     Claim(
         "V ranks the errors of colour", NO_NUMBER, "more",
         Evidence("uncertainty", of_scores("color", "all pixels"), RANK, "V", None, "sigma"),
-        "Spearman of V and squared error at held-back views",
+        "V and squared error, held-back views",
     ),
     Claim(
         "a learned σ² makes V rank them better than the scatter of colours alone", NO_NUMBER, "more",
@@ -147,7 +147,7 @@ VARSPLAT = (
         in_claims("varsplat", CPU, "V in tracking", "no likelihood"),
     ),
     Claim(
-        "registration averages colour errors over values (3HW), not pixels (HW)", "a formula, no number", "less",
+        "registration averages colour errors over values (3HW), not pixels (HW)", "a formula", "less",
         in_claims("registration", ERROR, "mean over values", "mean over pixels"),
     ),
     Claim(
@@ -180,7 +180,7 @@ CGSLAM = (
     Claim(
         "U ranks the errors of depth", NO_NUMBER, "more",
         Evidence("uncertainty", of_scores("depth", "covered pixels"), RANK, "U", None, "sigma"),
-        "Spearman of U and squared error at held-back views; U about the rendered depth",
+        "the same of depth; U about the rendered depth",
     ),
     Claim(
         "alignment and variance bring splats to the surface", "ablation, Replica: Chamfer 4.79 → 3.85 cm", "less",
@@ -236,7 +236,7 @@ CGSLAM = (
         in_claims("cgslam", ATE, "full", "without isotropy"),
     ),
     Claim(
-        "pruning by the uncertainty of primitives lowers the ATE", "a curve for room1, no number", "less",
+        "pruning by the uncertainty of primitives lowers the ATE", "a curve for room1", "less",
         in_claims("cgslam", ATE, "full", "without fading"),
     ),
     Claim(
@@ -248,15 +248,15 @@ CGSLAM = (
         in_weights("path", ATE, "default", "mapping: no U"),
     ),
     Claim(
-        "tracking by pixels or splats of low U lowers the ATE", "overview, no number", "less",
-        in_weights("path", ATE, "tracking: depth by U", "default"), "ours: depth weighted by U, against V",
+        "tracking by pixels or splats of low U lowers the ATE", "overview", "less",
+        in_weights("path", ATE, "tracking: depth by U", "default"), "ours: U against V",
     ),
     Claim(
         "the complete pose gradient is more accurate than the released code's", NO_NUMBER, "less",
         Evidence("pose-gradient", of_ways, ATE, "+ covariance", "mean + depth", "varsplat-fast"),
     ),
     Claim(
-        "the same of `cgslam-fast`", NO_NUMBER, "less", in_claims("cgslam", ATE, "full", "simplified gradient"),
+        "the complete gradient of the pose is more accurate (`cgslam-fast`)", NO_NUMBER, "less", in_claims("cgslam", ATE, "full", "simplified gradient"),
         "without the path through the 2D covariance",
     ),
     Claim(
@@ -276,7 +276,7 @@ CGSLAM = (
         in_systems(SPLATS, "cgslam-fast", "varsplat-fast"),
     ),
     Claim(
-        "NetVLAD chooses the window faster than overlap", "stated, no number", "less", None,
+        "NetVLAD chooses the window faster than overlap", "stated", "less", None,
         "`sigmasplat download netvlad` gets its weights",
     ),
     Claim("ATE on Replica, TUM, ScanNet", "0.27, 4.0, 8.08 cm", "less", None, NO_DATA.format("cgslam-replica")),

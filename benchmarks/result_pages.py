@@ -125,7 +125,7 @@ PAGES = {
         (
             Shown(
                 "ablation",
-                "VarSplat's uses of σ², added one by one: most figures change by less than one deviation.",
+                "VarSplat's uses of σ², added one by one.",
                 ("Verdicts",),
             ),
             Shown("weights", "Other uses of an uncertainty, each against the run without it.", ("Verdicts",)),

@@ -142,7 +142,7 @@ def test_a_row_holds_differences_at_equal_seeds_and_where_they_lie(tmp_path: Pat
 def test_a_figure_itself_is_compared_with_zero(tmp_path: Path) -> None:
     runs = [(source, "with", seed, 0.5 + 0.1 * seed) for source in ("kitchen", "hall") for seed in range(3)]
     write(tmp_path, runs, "score")
-    assert tables.row(claim("more", SCORE, None), tmp_path)[4:6] == ["0.60 [0.60, 0.60]", "**holds**"]
+    assert tables.row(claim("more", SCORE, None), tmp_path)[4:6] == ["0.60 [0.60…0.60]", "**holds**"]
 
 
 def test_figures_that_are_zero_in_all_runs_show_nothing(tmp_path: Path) -> None:
