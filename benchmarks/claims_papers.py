@@ -256,7 +256,8 @@ CGSLAM = (
         Evidence("pose-gradient", of_ways, ATE, "+ covariance", "mean + depth", "varsplat-fast"),
     ),
     Claim(
-        "the complete gradient of the pose is more accurate (`cgslam-fast`)", NO_NUMBER, "less", in_claims("cgslam", ATE, "full", "simplified gradient"),
+        "the complete gradient of the pose is more accurate (`cgslam-fast`)", NO_NUMBER, "less",
+        in_claims("cgslam", ATE, "full", "simplified gradient"),
         "without the path through the 2D covariance",
     ),
     Claim(

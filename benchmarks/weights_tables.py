@@ -93,10 +93,8 @@ def verdicts(runs: Runs) -> Section:
             cells = ["; ".join(f"{d.figure.title} ({d.written()})" for d in by[word]) or "–" for word in by]
             laid_out.append([change.what, judgement(found), f"{common_seeds(runs, change)}", *cells])
     note = (
-        "A figure is better or worse if the t interval of the sequences' mean differences excludes 0, at "
-        f"{100 * (1 - CHANCE):.0f} % for all figures of a change together (Bonferroni): a change without any effect is "
-        f"called one in at most {CHANCE:.0%} of cases. Lengths and angles are compared in percent. *mixed*: better and "
-        "worse."
+        "Better, worse: the t interval of the sequences' mean differences excludes 0, at "
+        f"{100 * (1 - CHANCE):.0f} % for all figures of a change together (Bonferroni). *mixed*: better and worse."
     )
     head = ["change", "verdict", "seeds", "better", "worse"]
     return Section("Verdicts", head, laid_out, note if len(sources_of(runs)) > 1 else "")
