@@ -19,8 +19,9 @@ HEAD = """# Settings
 `--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
 all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m` metres, `_deg` degrees,
 `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. § is a heading of
-[varsplat.md](varsplat.md) or [cgslam.md](cgslam.md). "Ours" marks what is in neither paper. *Takes* is the type and the valid range. *Changed by* names the systems with another value in some preset. A run
-is refused if a value is out of range, infinite or not a number; the error names all of them.
+[varsplat.md](varsplat.md) or [cgslam.md](cgslam.md). "Ours" marks what is in neither paper. *Takes* is the type and
+the valid range. *Changed by* names the systems with another value in some preset. A run is refused if a value is out of
+range, infinite or not a number; the error names all of them.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """

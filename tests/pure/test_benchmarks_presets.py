@@ -71,7 +71,7 @@ def test_a_light_preset_runs_at_half_the_size_of_the_other() -> None:
         override(preset(name), split_settings(paper_presets.sized(name))) for name in ("cgslam-tum", "cgslam-light-tum")
     )
     assert (full.input.width, light.input.width) == (160, 80)
-    assert full == light.changed(input={"width": 160})
+    assert full == replace(light.changed(input={"width": 160}), name=full.name)
 
     def result(name: str, width_px: int) -> dict[str, Any]:
         job = {"source": "kitchen", "preset": name, "settings": [f"input.width={width_px}"]}

@@ -188,7 +188,7 @@ def test_a_table_says_what_was_replaced(tmp_path: Path) -> None:
         cells = table.cells(1, dict(change.split("=") for change in changes))
         return "\n".join(Written.of(table, cells, Batch([], tmp_path), 1, {}, None).lines)
 
-    assert "Replaced: NetVLAD, by the built-in descriptor, in VarSplat. NetVLAD: `sigmasplat download" in lines()
+    assert "Replaced: NetVLAD by the built-in descriptor, in VarSplat; to use NetVLAD: sigmasplat download" in lines()
     assert "Replaced" not in lines("loops.weights=net.mat")
 
 

@@ -148,7 +148,7 @@ def _opened(
     if source.registrable and not source.depth_registered:
         screen.warn("depth and colour come from different cameras; --register-depth on aligns them (see inspect)")
     if lacks_netvlad(config):
-        screen.warn(f"no NetVLAD weights, so the built-in descriptor is used. {NETVLAD}")
+        screen.warn(f"no NetVLAD weights, so the built-in descriptor is used; {NETVLAD}")
     return source, config
 
 

@@ -48,14 +48,15 @@ def make_descriptor(config: LoopConfig) -> Descriptor:
     if config.descriptor == "grid" or _lacks_weights(config):
         return OrientationGrid()
     if not config.weights:
-        raise ConfigError(f"loops.descriptor=netvlad needs a file of weights. {NETVLAD}")
+        raise ConfigError(f"loops.descriptor=netvlad needs a file of weights; {NETVLAD}")
     from sigmasplat.graph.netvlad import NetVlad, NetVladWeights
 
     return NetVlad(NetVladWeights.load(config.weights))
 
 
-NETVLAD = "NetVLAD: `sigmasplat download netvlad`, then --set loops.weights=data/netvlad/VGG16-NetVLAD-Pitts30K.mat"
-"""How to get and use the weights."""
+NETVLAD = (
+    "to use NetVLAD: sigmasplat download netvlad, then --set loops.weights=data/netvlad/VGG16-NetVLAD-Pitts30K.mat"
+)
 
 
 def lacks_netvlad(config: Config) -> bool:

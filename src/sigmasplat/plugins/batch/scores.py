@@ -177,7 +177,7 @@ def _remarks(table: Table, cells: Sequence[Cell], batch: Batch, conditions: Mapp
     absent = dict.fromkeys(cell.scene for cell in cells if cell.job.name in batch.missing)
     lines += [f"Missing: {', '.join(absent)}."] if absent else []
     replaced = dict.fromkeys(cell.system for cell in cells if lacks_netvlad(cell.job.config))
-    lines += [f"Replaced: NetVLAD, by the built-in descriptor, in {', '.join(replaced)}. {NETVLAD}"] if replaced else []
+    lines += [f"Replaced: NetVLAD by the built-in descriptor, in {', '.join(replaced)}; {NETVLAD}."] if replaced else []
     return lines + [f"Failed: {name}: {why}" for name, why in batch.failed.items()]
 
 
