@@ -88,11 +88,13 @@ text { font: 13px system-ui, sans-serif; fill: #1f2328 }
 @cache
 def imported(tree: ast.AST) -> tuple[str, ...]:
     """Return every module, or name in one, that a file imports, dotted; at the top or inside a function. A name of the
-    API is that of its home."""
+    API, `api.name` too, is that of its home."""
     found = list[str]()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            found += [alias.name for alias in node.names if alias.name != "sigmasplat.api"]
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "api":
+            found.append(f"{api_homes()[node.attr]}.{node.attr}")
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute, so that the layers can be read"
             homes = api_homes() if node.module == "sigmasplat.api" else {}

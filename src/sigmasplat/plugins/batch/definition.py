@@ -4,18 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, get_type_hints
 
-from sigmasplat.api import (
-    MOST_NUMBER,
-    Config,
-    ConfigError,
-    fits,
-    guarded,
-    list_presets,
-    nearest,
-    override,
-    preset,
-    presets_by_scene,
-)
+import sigmasplat.api as api
+from sigmasplat.api import ConfigError
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.presets.shared_by_papers import read_values
 from sigmasplat.plugins.presets.table_files import read_table
@@ -73,7 +63,7 @@ class Score:
             found: Any = record
             for part in key.split("."):
                 found = found.get(part) if isinstance(found, Mapping) else None
-            if isinstance(found, int | float) and abs(found) <= MOST_NUMBER:
+            if isinstance(found, int | float) and abs(found) <= api.MOST_NUMBER:
                 return self.factor * found
         return None
 
@@ -107,7 +97,7 @@ class Table:
         """Read a definition. Raises ConfigError if it is unknown or not valid."""
         values, shared = read_table(name), read_values("values/tables")
         parts = {"scenes": Scene, "systems": System, "scores": Score, "published": Published}
-        with guarded(f"table {name}", "docs/tables.md shows a definition", ConfigError, "not valid"):
+        with api.guarded(f"table {name}", "docs/tables.md shows a definition", ConfigError, "not valid"):
             values = (shared["data"][values.pop("data")] if "data" in values else {}) | values
             named = [{"name": s} | shared["scores"][s] if isinstance(s, str) else s for s in values.get("scores", [])]
             source = {"source": values.pop("source")} if "source" in values else {}
@@ -133,14 +123,14 @@ class Table:
         Raises ConfigError on an unknown name.
         """
         of_table = {system.name: system for system in self.systems}
-        presets = [*list_presets(), *presets_by_scene()]
+        presets = [*api.list_presets(), *api.presets_by_scene()]
         ends = [f"-{scene.name}" for scene in self.scenes]
         presets += [f"{name.removesuffix(end)}-{{scene}}" for end in ends for name in presets if name.endswith(end)]
         known = of_table | {name: System(name, name) for name in presets if name not in of_table}
         for name in names:
             if name not in known:
                 there = f"{', '.join(of_table)}, and all presets"
-                raise ConfigError(f"table {self.name} has no system {name!r}{nearest(name, known)}; it has {there}")
+                raise ConfigError(f"table {self.name} has no system {name!r}{api.nearest(name, known)}; it has {there}")
         chosen = [known[name] for name in dict.fromkeys(names)]
         return replace(self, systems=tuple(chosen or (system for system in self.systems if system.default)))
 
@@ -155,7 +145,7 @@ class Table:
         for name in scenes:
             if name not in known:
                 there = ", ".join(known)
-                raise ConfigError(f"table {self.name} has no scene {name!r}{nearest(name, known)}; it has {there}")
+                raise ConfigError(f"table {self.name} has no scene {name!r}{api.nearest(name, known)}; it has {there}")
         return [
             Cell(scene.name, system.name, seed, self._job(scene, system, seed, settings, limit))
             for seed in range(seeds) for scene in self.scenes if not scenes or scene.name in scenes
@@ -164,8 +154,8 @@ class Table:
 
     def _job(self, scene: Scene, system: System, seed: int, settings: Mapping[str, str], limit: int | None) -> Job:
         length = {"input.limit": str(self.limit if limit is None else limit)}
-        chosen = preset(system.preset.replace("{scene}", scene.name))
-        config: Config = override(chosen, length | dict(system.settings) | dict(settings) | {"seed": str(seed)})
+        chosen = api.preset(system.preset.replace("{scene}", scene.name))
+        config: api.Config = api.override(chosen, length | dict(system.settings) | dict(settings) | {"seed": str(seed)})
         paths = tuple(f"{folder}/{scene.path}".lstrip("/") for folder in self.folders)
         name = "".join(
             c if c.isalnum() or c in "._-" else "-" for c in f"{scene.name}-{system.name}-seed{seed}".lower()
@@ -187,6 +177,6 @@ def _typed(part: Any) -> Any:
     """Return a part of a definition. Raises TypeError if a value is not of the type of its field."""
     hints = get_type_hints(type(part))
     for each in fields(part):
-        if not fits(value := getattr(part, each.name), hints[each.name]):
+        if not api.fits(value := getattr(part, each.name), hints[each.name]):
             raise TypeError(f"{each.name} of a {type(part).__name__.lower()} cannot be {value!r:.60}")
     return part

@@ -15,24 +15,8 @@ from pathlib import Path
 
 import torch
 
-from sigmasplat.api import (
-    Config,
-    RunError,
-    RunFolder,
-    Session,
-    SigmaSplatError,
-    Slam,
-    Source,
-    StartPoint,
-    StateFile,
-    env,
-    is_out_of_memory,
-    locked,
-    new_folder,
-    open_scene,
-    out_of_memory,
-    resume,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Config, RunFolder, SigmaSplatError, Source, StartPoint, env
 from sigmasplat.plugins.batch.job import Job
 from sigmasplat.plugins.evaluation.evaluate import evaluate
 from sigmasplat.plugins.evaluation.metrics.lpips import find_lpips
@@ -46,11 +30,11 @@ def make_run(job: Job, folder: Path, data: str | None, save_every_s: float) -> N
     Raises SigmaSplatError if the sequence or the result cannot be used, KeyboardInterrupt if Ctrl-C stopped the run.
     """
     try:
-        with locked(folder, wait=True):  # a second process waits
+        with api.locked(folder, wait=True):  # a second process waits
             if job.finished_in(folder):
                 return
             path = job.sequence(data)
-            source, config = open_scene(path, job.config, job.given)
+            source, config = api.open_scene(path, job.config, job.given)
             _make_and_score(job, RunFolder(folder), source, config, path, save_every_s)
     except BaseException:
         with suppress(OSError):  # the lock has created the folder
@@ -63,14 +47,14 @@ def _make_and_score(
 ) -> None:  # fmt: skip
     if not (job.started_in(run.path) and run.facts().get("status") == "complete"):
         run, start = _started(job, run.path, source, config, path)
-        state = StateFile(start.slam, run, save_every_s)
-        outcome = Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
+        state = api.StateFile(start.slam, run, save_every_s)
+        outcome = api.Session(start.slam, source, run, (), state, start.next_index, start.wall_s).execute()
         if outcome.status == "interrupted":
             raise KeyboardInterrupt
     started_s = time.perf_counter()
     lpips, _ = find_lpips(env.LPIPS_FOLDER)
     if why := evaluate(run, source, mesh=job.mesh, lpips=lpips)["failure"]:
-        raise RunError(why)
+        raise api.RunError(why)
     run.note(batch=job.facts() | {"scored": True, "scoring_s": time.perf_counter() - started_s})
 
 
@@ -79,11 +63,11 @@ def _started(job: Job, folder: Path, source: Source, config: Config, path: str) 
     if job.started_in(folder) and RunFolder(folder).state.is_file():
         with suppress(SigmaSplatError):  # a damaged state costs time, not the table
             run = RunFolder.open(folder)
-            start = resume(run, source)
+            start = api.resume(run, source)
             run.note(status="running", source_path=path)
             return run, start
-    run = new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
-    return run, StartPoint(Slam(config, run.submaps.in_background()))
+    run = api.new_folder(folder, config, source, overwrite=True, source_path=path, batch=job.facts())
+    return run, StartPoint(api.Slam(config, run.submaps.in_background()))
 
 
 def _end_with_parent() -> None:
@@ -106,9 +90,9 @@ def main(job_text: str, folder: str, save_every_s: str, data: str | None = None)
     except KeyboardInterrupt:
         return INTERRUPTED
     except Exception as problem:
-        if not is_out_of_memory(problem):
+        if not api.is_out_of_memory(problem):
             raise
-        print(out_of_memory(problem), file=sys.stderr)
+        print(api.out_of_memory(problem), file=sys.stderr)
         return REFUSED
     return 0
 

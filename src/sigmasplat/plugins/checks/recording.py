@@ -10,21 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.api import (
-    CameraUnknown,
-    Frame,
-    InputConfig,
-    Source,
-    SourceError,
-    default_preset,
-    depth_warning,
-    evenly_spaced,
-    evenly_spread,
-    format_name,
-    list_presets,
-    to_bytes,
-    unlikely_camera,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Frame, InputConfig, Source, SourceError
 from sigmasplat.plugins.checks.depth import EdgeAgreement, edge_agreement, overlay
 from sigmasplat.plugins.checks.motion import MANY_HOLES, Motion, motion_warnings, rate, time_warnings, times_of
 from sigmasplat.plugins.sources import open_source
@@ -70,17 +57,17 @@ def inspect_source(
 ) -> Inspection:
     """Open a recording and inspect `samples` frames, evenly spaced; exposure: whether a run will fit it. Raises
     SourceError if it cannot be opened."""
-    name, (source, guessed) = format_name(path, settings), _opened(path, settings)
+    name, (source, guessed) = api.format_name(path, settings), _opened(path, settings)
     first = max(0, (len(source) - CONSECUTIVE) // 2)
     consecutive, frames = range(first, min(first + CONSECUTIVE, len(source))), list[Frame]()
-    sampled = evenly_spaced(len(source), samples).tolist()
+    sampled = api.evenly_spaced(len(source), samples).tolist()
     motion = Motion.of(_readable(source, sampled, consecutive, frames, source.skipped))
     if not frames:
         raise SourceError(f"{source.name}: none of {samples} sampled frames can be read; check the image files")
     agreement = _agreement(source, frames)
     times_s = times_of(source)
     warnings = [
-        *guessed, *filter(None, [unlikely_camera(source.camera)]), *time_warnings(times_s),
+        *guessed, *filter(None, [api.unlikely_camera(source.camera)]), *time_warnings(times_s),
         *_warnings(source, frames, settings, agreement, exposure), *motion_warnings(motion, first),
     ]  # fmt: skip
     rows = [
@@ -98,7 +85,7 @@ def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]
     """Open a recording. If its camera is unknown, use a typical one and warn."""
     try:
         return open_source(path, settings), []
-    except CameraUnknown as problem:
+    except api.CameraUnknown as problem:
         fx = round(USUAL_FOCAL * problem.size[0])
         return open_source(path, settings, fx=float(fx)), [f"{problem}; this inspection assumes fx = {fx} pixels"]
 
@@ -106,7 +93,7 @@ def _opened(path: str | Path, settings: InputConfig) -> tuple[Source, list[str]]
 def first_look(source: Source) -> tuple[str, list[str]]:
     """Look at the first frames before a run: what they show, in one line, "" if none can be read; and warnings."""
     frames, started_s = list[Frame](), time.perf_counter()
-    for i in evenly_spaced(min(FIRST, len(source)), LOOKED_AT).tolist():
+    for i in api.evenly_spaced(min(FIRST, len(source)), LOOKED_AT).tolist():
         [*_readable(source, [i], (), frames, [])]
         if time.perf_counter() - started_s > ENOUGH_S:
             break
@@ -114,8 +101,8 @@ def first_look(source: Source) -> tuple[str, list[str]]:
         return "", []
     agreement = None if source.registrable and not source.depth_registered else _agreement(source, frames)
     warnings = [
-        *filter(None, [unlikely_camera(source.camera), depth_warning(source, read=frames)]), *source.depth_doubts,
-        *_registration_warnings(source, agreement),
+        *filter(None, [api.unlikely_camera(source.camera), api.depth_warning(source, read=frames)]),
+        *source.depth_doubts, *_registration_warnings(source, agreement),
     ]  # fmt: skip
     unit, readings = "" if source.predicted_depth else " m", _readings(frames)
     low, middle, high = np.percentile(readings, (1, 50, 99)) if len(readings) else (0.0, 0.0, 0.0)
@@ -205,7 +192,7 @@ def _warnings(
     unused, every = len(source.skipped), len(source) + len(source.skipped)
     if unused > MANY_UNUSED * every:
         yield f"{unused} of {every} images are not used (first: {source.skipped[0]})"
-    yield from (*filter(None, [depth_warning(source, read=frames)]), *source.depth_doubts)
+    yield from (*filter(None, [api.depth_warning(source, read=frames)]), *source.depth_doubts)
     if _holes(frames) > MANY_HOLES:
         yield f"{_holes(frames):.0%} of the pixels have no depth; the map will have holes"
     max_depth_m = settings.max_depth_m * source.scene_scale
@@ -237,8 +224,8 @@ def _registration_warnings(source: Source, agreement: EdgeAgreement | None) -> l
 
 def _suggested(format_name: str) -> str:
     data_set = format_name.lower().split()[-1].replace("++", "pp")
-    papers = [name for name in list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
-    return default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
+    papers = [name for name in api.list_presets() if name.endswith(f"-{data_set}") and name.count("-") == 1]
+    return api.default_preset() + (f" (settings of the papers, slow on CPUs: {', '.join(papers)})" if papers else "")
 
 
 def _sheet(frames: list[Frame]) -> Image.Image:
@@ -246,12 +233,12 @@ def _sheet(frames: list[Frame]) -> Image.Image:
     from sigmasplat.plugins.outputs.drawing import colormap  # a run, which does not draw, starts 0.3 s earlier
     from sigmasplat.plugins.outputs.drawing.view_panels import ViewPanel, coloured, draw_view_strip
 
-    chosen = evenly_spread(frames, SHOWN)
+    chosen = api.evenly_spread(frames, SHOWN)
     depths = np.concatenate([frame.depth_m.reshape(-1) for frame in chosen])
     limits = colormap.value_range(depths, depths > 0)
     strips = [
         draw_view_strip([
-            ViewPanel("colour", to_bytes(frame.color * 255.0), f"{frame.timestamp_s:.2f} s"),
+            ViewPanel("colour", api.to_bytes(frame.color * 255.0), f"{frame.timestamp_s:.2f} s"),
             coloured("depth", frame.depth_m, frame.depth_m > 0, limits, colormap.VIRIDIS, " m"),
             ViewPanel("depth outlines", overlay(frame)),
         ], SHEET_PX)

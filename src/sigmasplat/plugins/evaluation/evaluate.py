@@ -7,30 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.api import (
-    TRUTH,
-    Camera,
-    Config,
-    FieldRenderer,
-    FinalConfig,
-    GaussianField,
-    Matrix,
-    Mesh,
-    Predicted,
-    Progress,
-    RunError,
-    RunFolder,
-    RunFrames,
-    Source,
-    SourceError,
-    Trajectory,
-    as_refined,
-    evenly_spread,
-    frame_seconds,
-    no_progress,
-    predict,
-    write_trajectory,
-)
+import sigmasplat.api as api
+from sigmasplat.api import FinalConfig, GaussianField, Matrix, RunError, RunFolder, RunFrames, Source, Trajectory
 from sigmasplat.plugins.evaluation import reconstruct, run_views, view_scores
 from sigmasplat.plugins.evaluation.failure import failure, scale_to_truth, wrong_scale
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
@@ -56,8 +34,8 @@ KINDS = {"held-out": False, "training": True}
 
 def evaluate(
     run: RunFolder, source: Source, *, renderer: view_scores.Renderer | None = None, views_per_kind: int = 40,
-    strips_per_kind: int = 3, mesh: bool = False, true_mesh: Mesh | None = None, random_views: int = VIEWS,
-    full_resolution: bool = False, lpips: Lpips | None = None, progress: Progress = no_progress,
+    strips_per_kind: int = 3, mesh: bool = False, true_mesh: api.Mesh | None = None, random_views: int = VIEWS,
+    full_resolution: bool = False, lpips: Lpips | None = None, progress: api.Progress = api.no_progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Score trajectory, map and uncertainty of a run against its source, and return the metrics written.
 
@@ -76,11 +54,11 @@ def evaluate(
     records, log = frames.log, frames.posed_log()
     known, scale, path_scores, problem = _score_path(run, frames, source)
     kinds = {kind: [r for r in log if bool(r["is_keyframe"]) == of_map] for kind, of_map in KINDS.items()}
-    chosen = {kind: evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
+    chosen = {kind: api.evenly_spread(records, views_per_kind) for kind, records in kinds.items()}
     strips, config = ViewStrips(strips_per_kind), run.config()
     fx, path = run_views.refined_fx(config, source.camera), frames.path
     aligned = None if known is None else truth_in_estimate(path.timestamps_s, path.T_world_camera[:, :3, 3], known)
-    standard, renderer = renderer is None, renderer or FieldRenderer(config.render, config.backend, (field, fx))
+    standard, renderer = renderer is None, renderer or api.FieldRenderer(config.render, config.backend, (field, fx))
     maps, readouts = _map_sources(run, field, records, config.final), frames.readouts(run.facts())
     maps, predictions = (
         _predicting(maps, run, frames, config, fx) if standard else (maps, view_scores.PredictionScores())
@@ -126,7 +104,7 @@ def _read_frames(run: RunFolder) -> RunFrames:
 
 def _score_path(
     run: RunFolder, frames: RunFrames, source: Source
-) -> tuple[Trajectory | None, float | None, dict[str, Any], SourceError | None]:
+) -> tuple[Trajectory | None, float | None, dict[str, Any], api.SourceError | None]:
     """Return the true path in the units of the run, None if it shares no timestamps; the run's unit in metres if it is
     arbitrary; and what `score_path` returns."""
     truth = source.truth() if len(frames.rows) else None  # without a valid pose nothing is aligned
@@ -156,7 +134,7 @@ def _map_sources(run: RunFolder, field: GaussianField, records: Log, final: Fina
 
 
 def _predicting(
-    maps: view_scores.MapSources, run: RunFolder, frames: RunFrames, config: Config, fx: float | None
+    maps: view_scores.MapSources, run: RunFolder, frames: RunFrames, config: api.Config, fx: float | None
 ) -> tuple[view_scores.MapSources, view_scores.PredictionScores]:
     """Add the prediction of errors to the maps if the run measured how sure its map is; fx: `refined_fx`. Raises
     RunError if that belongs to another map."""
@@ -165,9 +143,9 @@ def _predicting(
     if known is None:
         return maps, view_scores.PredictionScores()
 
-    def predict_view(camera: Camera, T_camera_world: NDArray[np.float64]) -> Predicted:
-        options = as_refined(config.render, camera, fx)
-        return predict(field, known, camera, T_camera_world, options, config.backend)
+    def predict_view(camera: api.Camera, T_camera_world: NDArray[np.float64]) -> api.Predicted:
+        options = api.as_refined(config.render, camera, fx)
+        return api.predict(field, known, camera, T_camera_world, options, config.backend)
 
     probes = [row for index in range(len(run.submaps)) for row in run.submaps.load(index).probe_frames]
     calibrated_on = frozenset(frames.log[row]["index"] for row in probes if 0 <= row < len(frames))
@@ -190,13 +168,15 @@ def _submaps(log: Log) -> int:
 
 def _score_views(
     scoring: ViewScoring, final: FinalConfig, predictions: view_scores.PredictionScores, strips: ViewStrips,
-    progress: Progress,
+    progress: api.Progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Render the chosen views from the final map and from their submaps; average scores per kind and map; judge V and
     the predictive variances. V is judged on held-out views, or on training views if every frame was mapped.
     """
     chosen, maps = scoring.chosen, scoring.maps
-    shown = {(kind, r["index"]) for kind, records in chosen.items() for r in evenly_spread(records, strips.per_kind)}
+    shown = {
+        (kind, r["index"]) for kind, records in chosen.items() for r in api.evenly_spread(records, strips.per_kind)
+    }
 
     def see(view: ScoredView, in_submap: ScoredView | None) -> None:
         predictions.add(view)
@@ -220,14 +200,14 @@ def _score_views(
 def _facts(run: RunFolder, source: Source, log: Log, field: GaussianField) -> dict[str, Any]:
     facts, loops = run.facts(), run.read_loops()
     wall_s, finish_s = facts.get("wall_s"), facts.get("finish_s")
-    seconds = wall_s or sum(frame_seconds(record) for record in log)
+    seconds = wall_s or sum(api.frame_seconds(record) for record in log)
     return {
         "source": source.name, "status": facts.get("status"), "frames": len(log),
         "keyframes": sum(bool(record["is_keyframe"]) for record in log),
         "skipped": facts.get("skipped", list(source.skipped)), "splats": len(field), "map_bytes": run.map_bytes(),
         "frames_per_s": len(log) / seconds if seconds else None,
         # The first frame, which creates the map, does not count.
-        "worst_frame_s": max(map(frame_seconds, log[1:]), default=0.0) or None,
+        "worst_frame_s": max(map(api.frame_seconds, log[1:]), default=0.0) or None,
         "submaps": _submaps(log), "onto": (facts.get("onto") or {}).get("run"),
         "loops": {"tried": len(loops), "accepted": sum(bool(loop.get("accepted")) for loop in loops)},
         "finish_s": finish_s, "final_steps": facts.get("final_steps"),
@@ -240,13 +220,14 @@ def _aligned_truth(
 ) -> Matrix | None:
     """Return the true positions of the valid frames in the world of the run [B, 3], nan if unknown, and write truth.txt
     if it is the truth."""
-    (run.path / TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
+    (run.path / api.TRUTH).unlink(missing_ok=True)  # of an earlier evaluation
     if truth is None or T_estimate_truth is None:
         return None
     rows, truth_rows = associate(path.timestamps_s, truth.timestamps_s)
     T_world_camera = T_estimate_truth @ truth.T_world_camera[truth_rows]
     if is_true:
-        write_trajectory(run.path / TRUTH, Trajectory(path.timestamps_s[rows], T_world_camera))  # for the viewer
+        truth = Trajectory(path.timestamps_s[rows], T_world_camera)
+        api.write_trajectory(run.path / api.TRUTH, truth)  # for the viewer
     known = np.full((len(path), 3), np.nan)
     known[rows] = T_world_camera[:, :3, 3]
     return known

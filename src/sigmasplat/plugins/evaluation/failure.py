@@ -6,21 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from sigmasplat.api import (
-    APART,
-    KNOWN_UNITS_PER_METRE,
-    LOST,
-    Config,
-    RunFolder,
-    Source,
-    Trajectory,
-    default_preset,
-    depth_warning,
-    differences,
-    format_ranges,
-    is_preset,
-    preset,
-)
+import sigmasplat.api as api
+from sigmasplat.api import RunFolder, Source, Trajectory
 from sigmasplat.plugins.evaluation.metrics.trajectory import absolute_error, align_similarity, pair_poses
 
 MOST_LOST = 1.0 / 3.0
@@ -40,15 +27,15 @@ WRONG_SCALE, FITTED, FEWEST = 0.05, 0.1, 10
 def failure(run: RunFolder, source: Source) -> dict[str, list[str]]:
     """Return why a run failed, and commands to try; nothing if two thirds of its frames have a pose, none apart."""
     frames, config, facts = run.read_frames(), run.config(), run.facts()
-    without = sorted([*frames.indices(LOST), *(apart := frames.indices(APART))])
+    without = sorted([*frames.indices(api.LOST), *(apart := frames.indices(api.APART))])
     if not apart and len(without) <= MOST_LOST * len(frames):
         return {}
     pieces = f"; {len(apart)} of them are in other pieces of it (components/)" * bool(apart)
-    said = [f"{len(without)} of {len(frames)} images have no pose in the map ({format_ranges(without)}){pieces}"]
+    said = [f"{len(without)} of {len(frames)} images have no pose in the map ({api.format_ranges(without)}){pieces}"]
     why = [record.get("diagnosis", "") for record in frames.log if record.get("lost")]
     causes = Counter(next(cause for part, cause in CAUSES.items() if part in words) for words in why)
     said += [f"Likely cause: {cause}, in {count} images" for cause, count in causes.most_common(1)]
-    said += filter(None, [depth_warning(source)])
+    said += filter(None, [api.depth_warning(source)])
     said += [f"Assumed: {'; '.join(source.assumptions)}"] * bool(source.assumptions)
     commands = [rerun_command(config, facts, "inspect")]
     if source.path_by and not config.input.poses:
@@ -72,7 +59,7 @@ def wrong_scale(run: RunFolder, source: Source, scale: float | None) -> dict[str
     said = f"WRONG SCALE: the path is {times:.{1 + (times < 1.5)}f} times too {'small' if scale > 1.0 else 'large'}"
     if not units or config.input.poses:
         return {said: []}
-    usual = next((u for u in KNOWN_UNITS_PER_METRE if abs(u * scale / units - 1.0) < WRONG_SCALE), None)
+    usual = next((u for u in api.KNOWN_UNITS_PER_METRE if abs(u * scale / units - 1.0) < WRONG_SCALE), None)
     what = "the depth unit" if usual else "depth or the focal length"
     remedy = f"--depth-scale {usual or float(f'{units / scale:.2g}'):g}"
     origin = source.origins.get("depth unit")
@@ -80,12 +67,12 @@ def wrong_scale(run: RunFolder, source: Source, scale: float | None) -> dict[str
     return {said: [f"{rerun_command(config, run.facts())} {remedy}"]}
 
 
-def rerun_command(config: Config, facts: dict[str, Any], command: str = "run") -> str:
+def rerun_command(config: api.Config, facts: dict[str, Any], command: str = "run") -> str:
     """Return the command that makes the run again, or inspects its recording: its preset, and what differs from it."""
     words, of_run = ["sigmasplat", command, str(facts.get("source_path") or "PATH")], command == "run"
     if of_run and (onto := facts.get("onto")):
         words += ["--onto", str(onto["run"])]
-    pairs = differences(config, preset(config.name)) if is_preset(config.name) else []
-    if of_run and config.name != default_preset() and is_preset(config.name):
+    pairs = api.differences(config, api.preset(config.name)) if api.is_preset(config.name) else []
+    if of_run and config.name != api.default_preset() and api.is_preset(config.name):
         words += ["--preset", config.name]
     return shlex.join([*words, *(w for p in pairs if of_run or p.startswith("input.") for w in ("--set", p))])

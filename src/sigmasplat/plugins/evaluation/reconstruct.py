@@ -13,27 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sigmasplat.api import (
-    MESH,
-    Camera,
-    Config,
-    FusionView,
-    GaussianField,
-    Matrix,
-    Mesh,
-    Progress,
-    Renderer,
-    RunError,
-    RunFolder,
-    Source,
-    Trajectory,
-    count_keyframes,
-    fuse,
-    no_progress,
-    se3,
-    surface_views,
-    voxel_edge,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, FusionView, Mesh, Progress, Renderer, RunError, RunFolder, Trajectory, se3
 from sigmasplat.plugins.evaluation.metrics import reconstruction
 from sigmasplat.plugins.evaluation.metrics.published_reconstruction import VIEWS, score_published
 from sigmasplat.plugins.evaluation.metrics.reconstruction import score_splats
@@ -50,7 +31,7 @@ class FusionInput:
     """What fusion needs from a run, read once: settings, checkpoint, and the camera of its working images."""
 
     run: RunFolder
-    config: Config
+    config: api.Config
     checkpoint: dict[str, Tensor]
     camera: Camera
 
@@ -89,13 +70,13 @@ class FusionInput:
             None if name not in tensors else np.asarray(tensors[name], np.float64)
             for name in ("T_world_keyframe", "exposure")
         )
-        views = surface_views(
+        views = api.surface_views(
             self.run.read_map, submaps, list(anchors), self.config, outside, T_world_keyframe, exposures
         )
-        return views, count_keyframes(submaps, outside)
+        return views, api.count_keyframes(submaps, outside)
 
     def surface(
-        self, voxel_m: float | None = None, renderer: Renderer | None = None, progress: Progress = no_progress
+        self, voxel_m: float | None = None, renderer: Renderer | None = None, progress: Progress = api.no_progress
     ) -> Mesh:
         """Fuse renders of the map at the keyframes into a mesh in the run's world.
 
@@ -103,9 +84,9 @@ class FusionInput:
         `progress(done, total)` with keyframes. voxel_m None: `voxel_edge`. Raises RunError as `views` does; ConfigError
         unless voxel_m > 0.
         """
-        voxel_m = voxel_edge(self.views()[0], self.config) if voxel_m is None else voxel_m
+        voxel_m = api.voxel_edge(self.views()[0], self.config) if voxel_m is None else voxel_m
         views, total = self.views()
-        mesh = fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
+        mesh = api.fuse(views, total, self.config, voxel_m=voxel_m, renderer=renderer, progress=progress)
         field, std = self.run.read_splat_std() or (None, None)
         nearest = None if field is None else nearest_opaque(field, mesh.vertices.astype(np.float64))
         if std is None or nearest is None:
@@ -113,7 +94,7 @@ class FusionInput:
         return replace(mesh, depth_std_m=std.depth_std_m.numpy()[nearest].astype(np.float32))
 
 
-def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | None:
+def nearest_opaque(field: api.GaussianField, points: api.Matrix) -> NDArray[np.intp] | None:
     """Return the nearest splat [V] to each point [V, 3], m, whose opacity is at least ½; None if there is none."""
     opaque = np.flatnonzero((field.opacities >= OPAQUE).cpu().numpy())
     if not len(opaque):
@@ -122,7 +103,7 @@ def nearest_opaque(field: GaussianField, points: Matrix) -> NDArray[np.intp] | N
     return np.asarray(opaque[nearest], np.intp)
 
 
-def known_surface(source: Source) -> Mesh | None:
+def known_surface(source: api.Source) -> Mesh | None:
     """Return the true surface of a source: exact, or read from the file beside the sequence; None without one.
 
     Raises SourceError if the file cannot be read.
@@ -133,13 +114,13 @@ def known_surface(source: Source) -> Mesh | None:
 
 def fuse_and_score(
     run: RunFolder, camera: Camera, true_surface: Mesh | None, true_path: Trajectory | None, random_views: int = VIEWS,
-    renderer: Renderer | None = None, progress: Progress = no_progress,
+    renderer: Renderer | None = None, progress: Progress = api.no_progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the run's mesh.ply and return its scores, as `score` does; they are None if the true surface or the true
     path is unknown."""
     fusion_input = FusionInput.of(run, camera)
     mesh = fusion_input.surface(None, renderer, progress)
-    write_mesh(run.path / MESH, mesh)
+    write_mesh(run.path / api.MESH, mesh)
     if true_surface is None or true_path is None:
         return {"reconstruction": None, "reconstruction_published": None}
     return score(fusion_input, mesh, true_surface, true_path, random_views, progress)
@@ -147,7 +128,7 @@ def fuse_and_score(
 
 def score(
     fusion_input: FusionInput, mesh: Mesh, true_surface: Mesh, true_path: Trajectory, random_views: int = VIEWS,
-    progress: Progress = no_progress,
+    progress: Progress = api.no_progress,
 ) -> dict[str, Any]:  # fmt: skip
     """Score a run's mesh and its splats against the true surface, after the same alignment as for the ATE.
 

@@ -11,21 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Camera,
-    Config,
-    Frame,
-    InputConfig,
-    Progress,
-    Readout,
-    Source,
-    SourceError,
-    evenly_spread,
-    no_progress,
-    photo_size,
-    read_at_once,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Config, InputConfig, Progress, Readout, Source, se3
 from sigmasplat.plugins.evaluation import view_scores
 from sigmasplat.plugins.evaluation.metrics.lpips import Lpips
 from sigmasplat.plugins.evaluation.metrics.trajectory import associate
@@ -96,7 +83,7 @@ def full_width(config: Config, camera: Camera) -> int | None:
     camera: of the recording.
     """
     final, settings = config.final, config.input
-    size = photo_size(camera, settings.width, settings.crop_px, final.width)
+    size = api.photo_size(camera, settings.width, settings.crop_px, final.width)
     return min(final.width, camera.width) if size and final.iterations else None
 
 
@@ -111,7 +98,7 @@ def refined_fx(config: Config, camera: Camera) -> float | None:
 
 
 def score_full_resolution(
-    scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = no_progress
+    scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = api.no_progress
 ) -> dict[str, Any] | None:
     """Score the chosen views and the test views at the size of the recording if `recorded`, else at that of the final
     map's last stage; None without that stage.
@@ -145,10 +132,10 @@ def score_test_views(
     if test_views is None or poses is None or T_estimate_truth is None:
         return None
     rendered = []
-    for i in evenly_spread(range(len(test_views)), scoring.most):
+    for i in api.evenly_spread(range(len(test_views)), scoring.most):
         try:
             frame = working_frame(test_views, settings, i)
-        except SourceError:
+        except api.SourceError:
             continue
         rows, found = associate(np.array([frame.timestamp_s]), poses.timestamps_s)
         if len(rows):
@@ -163,10 +150,10 @@ def score_test_views(
 
 def working_frame(
     source: Source, settings: InputConfig, index: int, readouts: Mapping[int, Readout] | None = None
-) -> Frame:
+) -> api.Frame:
     """Read a frame at the resolution, depth range and crop that SLAM works with, and as if all rows had been read at
     once where it is known when they were (readouts, by frame). Raises SourceError if unreadable."""
     s = settings
     frame = source.frame(index).prepared(s.width, s.min_depth_m, s.max_depth_m, s.crop_px)
     known = (readouts or {}).get(index)
-    return frame if known is None else read_at_once(frame, replace(known, late_s=frame.depth_late_s))
+    return frame if known is None else api.read_at_once(frame, replace(known, late_s=frame.depth_late_s))

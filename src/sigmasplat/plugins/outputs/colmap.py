@@ -12,19 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.api import (
-    Camera,
-    GaussianField,
-    Matrix,
-    Progress,
-    RunError,
-    make_folder,
-    no_progress,
-    replacing,
-    se3,
-    to_bytes,
-    write_text,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Matrix, Progress, se3
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Points = NDArray[np.floating]
@@ -33,7 +22,7 @@ MAX_POINTS = 100_000
 MIN_OPACITY = 0.5
 
 
-def splat_points(field: GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:
+def splat_points(field: api.GaussianField, most: int = MAX_POINTS) -> tuple[Matrix, Matrix]:
     """Return the centres [P, 3] m and colours [P, 3] of the opaque splats, evenly thinned to `most`."""
     opaque = np.flatnonzero(field.opacities.numpy() >= MIN_OPACITY)
     rows = opaque[np.linspace(0, len(opaque) - 1, min(most, len(opaque))).astype(int)]
@@ -54,16 +43,16 @@ def export_images(reader: RunReader, folder: Path, progress: Progress) -> Sequen
     Keyframes without a valid pose are left out. Returns their frame numbers. Raises RunError if no keyframe is left.
     """
     valid, written = set(reader.valid_frames()), []
-    make_folder(folder / IMAGES)
+    api.make_folder(folder / IMAGES)
     total = reader.count_keyframes()
     for done, (frame, picture) in enumerate(reader.keyframes(), 1):
         if frame in valid:
-            with replacing(folder / IMAGES / image_name(frame)) as temporary:
+            with api.replacing(folder / IMAGES / image_name(frame)) as temporary:
                 Image.fromarray(picture.color).save(temporary, "PNG")
             written.append(frame)
         progress(done, total)
     if not written:
-        raise RunError(f"run {reader.run.path} has no keyframes, so it has no images to export; run it again")
+        raise api.RunError(f"run {reader.run.path} has no keyframes, so it has no images to export; run it again")
     return written
 
 
@@ -71,13 +60,13 @@ SPARSE = Path("sparse") / "0"
 """The folder in which trainers that start from COLMAP look for a model."""
 
 
-def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = no_progress) -> int:
+def export_colmap(reader: RunReader, target: Path, images: bool = False, progress: Progress = api.no_progress) -> int:
     """Write a sparse model to sparse/0 in a folder; return the number of views.
 
     Views are all frames whose pose is valid; with `images` only the keyframes, whose images are written to images/.
     Raises RunError.
     """
-    make_folder(target / SPARSE)
+    api.make_folder(target / SPARSE)
     frames = export_images(reader, target, progress) if images else reader.valid_frames()
     names = [image_name(frame) for frame in frames]
     poses = reader.poses_of(frames).T_world_camera
@@ -86,7 +75,7 @@ def export_colmap(reader: RunReader, target: Path, images: bool = False, progres
 
 
 def write_model(
-    folder: Path, camera: Camera, names: Sequence[str], T_world_camera: Matrix, points: Points, colors: Points
+    folder: Path, camera: api.Camera, names: Sequence[str], T_world_camera: Matrix, points: Points, colors: Points
 ) -> None:
     """Write a model into an existing folder; all images have the same camera.
 
@@ -95,13 +84,13 @@ def write_model(
     """
     numbers = " ".join(f"{value:.12g}" for value in (camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5))
     head = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, FX, FY, CX, CY\n"
-    write_text(folder / "cameras.txt", f"{head}1 PINHOLE {camera.width} {camera.height} {numbers}\n")
+    api.write_text(folder / "cameras.txt", f"{head}1 PINHOLE {camera.width} {camera.height} {numbers}\n")
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; then POINTS2D as (X, Y, POINT3D_ID)"]
     for number, (name, T) in enumerate(zip(names, se3.inverse(T_world_camera), strict=True), 1):
         pose = (*se3.quaternion_from_rotation(T[:3, :3]), *T[:3, 3])
         lines += [f"{number} {' '.join(f'{value:.12g}' for value in pose)} 1 {name}", ""]  # no features
-    write_text(folder / "images.txt", "\n".join(lines) + "\n")
-    rows = zip(points.tolist(), to_bytes(colors * 255.0).tolist(), strict=True)
+    api.write_text(folder / "images.txt", "\n".join(lines) + "\n")
+    rows = zip(points.tolist(), api.to_bytes(colors * 255.0).tolist(), strict=True)
     made = (f"{i} {x:.6f} {y:.6f} {z:.6f} {r} {g} {b} 0\n" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1))
     head = "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n"
-    write_text(folder / "points3D.txt", head + "".join(made))
+    api.write_text(folder / "points3D.txt", head + "".join(made))

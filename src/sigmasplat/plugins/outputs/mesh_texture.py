@@ -12,23 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
-from sigmasplat.api import (
-    AGREE_SHARE,
-    Camera,
-    Config,
-    ConfigError,
-    FieldRenderer,
-    FusionView,
-    Matrix,
-    Mesh,
-    Progress,
-    install_package,
-    mesh_depth,
-    se3,
-    silhouettes,
-    surface_of,
-    unexposed,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Config, FusionView, Mesh, se3
 
 SIZES, TEXEL_M, FILLED = (2048, 4096), 0.005, 0.75
 """Edges of an atlas: the larger one if texels of the smaller one, of which this share is used, would be larger."""
@@ -55,7 +40,9 @@ def vertex_colors(mesh: Mesh) -> Floats:
     return np.full(mesh.vertices.shape, 0.7, np.float32) if mesh.colors is None else mesh.colors
 
 
-def textured(mesh: Mesh, views: Iterable[FusionView], total: int, config: Config, progress: Progress) -> TexturedMesh:
+def textured(
+    mesh: Mesh, views: Iterable[FusionView], total: int, config: Config, progress: api.Progress
+) -> TexturedMesh:
     """Return a mesh in the world with a texture of these views; vertices at the edges of charts are doubled.
 
     Texels that no view shows have the colours of the vertices. Views without images are rendered with the settings of
@@ -88,8 +75,8 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Floats]:
     try:
         import xatlas
     except ImportError as problem:
-        raise ConfigError(
-            f"a texture needs xatlas, which does not load ({problem}): {install_package('xatlas')}, "
+        raise api.ConfigError(
+            f"a texture needs xatlas, which does not load ({problem}): {api.install_package('xatlas')}, "
             "or give --no-texture"
         ) from problem
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
@@ -109,7 +96,7 @@ def _unwrapped(mesh: Mesh, size: int) -> tuple[Mesh, Floats]:
     return Mesh(mesh.vertices[row], faces.astype(np.int32), colors, std, filled), uv.astype(np.float32)
 
 
-def _parts(centers: Matrix) -> list[Indices]:
+def _parts(centers: api.Matrix) -> list[Indices]:
     """Halve points [N, 3] along their longest axis until no part has more than `FACES_AT_ONCE`."""
     parts = [np.arange(len(centers))]
     while max(map(len, parts)) > FACES_AT_ONCE:
@@ -123,7 +110,7 @@ def _texels(mesh: Mesh, uv: Floats, size: int) -> tuple[Indices, Indices, Floats
     """Return the texels of an atlas that show a face: places in the image [T], faces [T], shares of their corners
     [T, 3]. The charts are drawn as a flat mesh 1 m in front of a camera whose pixels are the texels."""
     flat = Mesh(np.column_stack([uv, np.ones(len(uv), np.float32)]), mesh.faces)
-    _, shown = mesh_depth(flat, Camera(size, size, size, size, -0.5, -0.5), np.eye(4))
+    _, shown = api.mesh_depth(flat, Camera(size, size, size, size, -0.5, -0.5), np.eye(4))
     places = np.flatnonzero(shown >= 0)
     faces = shown.ravel()[places].astype(np.int64)
     corners = np.moveaxis(flat.corners[faces], 1, 0) - np.column_stack([places % size + 0.5, places // size + 0.5,
@@ -139,11 +126,11 @@ def _seen(at: FusionView, mesh: Mesh, points: Floats, faces: Indices, config: Co
     Texels beside silhouettes do not count, nor where a reading contradicts the surface: something moved there.
     """
     camera, T, image, of = at.camera, se3.inverse(at.T_world_camera), *_image(at, config)
-    depth_m, face = mesh_depth(mesh, camera, T)
-    known = (face >= 0) & ~silhouettes(depth_m)
+    depth_m, face = api.mesh_depth(mesh, camera, T)
+    known = (face >= 0) & ~api.silhouettes(depth_m)
     if at.picture is not None:
         off_m = np.abs(at.picture.depth_m - depth_m)
-        known &= (at.picture.depth_m == 0) | (off_m < AGREE_SHARE * depth_m)
+        known &= (at.picture.depth_m == 0) | (off_m < api.AGREE_SHARE * depth_m)
     a, b, c = np.moveaxis(mesh.corners @ T[:3, :3].T + T[:3, 3], 1, 0)
     normal = np.cross(b - a, c - a)
     cosine = np.abs((normal * a).sum(1)) / (np.linalg.norm(normal, axis=1) * np.linalg.norm(a, axis=1) + 1e-30)
@@ -164,9 +151,9 @@ def _seen(at: FusionView, mesh: Mesh, points: Floats, faces: Indices, config: Co
 def _image(at: FusionView, config: Config) -> tuple[Floats, Camera]:
     """Return the colours of a view [H, W, 3] in the exposure of the map, in [0, 1], and their camera."""
     if at.picture is None:
-        seen = FieldRenderer(config.render, config.backend)(at.field, at.camera, at.T_camera_field)
-        return surface_of(seen, config)[1], at.camera
+        seen = api.FieldRenderer(config.render, config.backend)(at.field, at.camera, at.T_camera_field)
+        return api.surface_of(seen, config)[1], at.camera
     photo, color, camera = at.picture.photo, at.picture.unit_color, at.camera
     if photo is not None:
         color, camera = photo.color().astype(np.float32) / np.float32(255.0), photo.camera
-    return color if at.exposure is None else unexposed(color, at.exposure), camera
+    return color if at.exposure is None else api.unexposed(color, at.exposure), camera

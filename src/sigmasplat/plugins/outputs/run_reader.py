@@ -6,30 +6,18 @@ from functools import cached_property
 
 import numpy as np
 
-from sigmasplat.api import (
-    APART,
-    LOST,
-    Camera,
-    Config,
-    Matrix,
-    PathCovariance,
-    Picture,
-    RunError,
-    RunFolder,
-    RunFrames,
-    Trajectory,
-    guarded,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, RunError, RunFrames, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class RunReader:
     """A run whose files are read once."""
 
-    run: RunFolder
+    run: api.RunFolder
 
     @cached_property
-    def config(self) -> Config:
+    def config(self) -> api.Config:
         """Return the run's settings."""
         return self.run.config()
 
@@ -39,7 +27,7 @@ class RunReader:
         if len(self.run.submaps):
             return self.run.submaps.load(0).camera
         path, settings = self.run.path / "run.json", self.config.input
-        with guarded(path, "run it again", RunError, "its camera cannot be used"):
+        with api.guarded(path, "run it again", RunError, "its camera cannot be used"):
             return Camera(**self.run.facts()["camera"]).prepared(settings.width, settings.crop_px)
 
     @cached_property
@@ -71,13 +59,13 @@ class RunReader:
             raise RunError(f"run {self.run.path} has no valid pose of frame {unknown[0]}; choose another frame")
         return self.frames.path.at(np.searchsorted(self.frames.rows, frames))
 
-    def covariances(self) -> Matrix:
+    def covariances(self) -> api.Matrix:
         """Return the covariance of the poses of `valid_path` [B, 6, 6], of left twists in the world, m and rad.
 
         Raises RunError if the run did not record the errors of its path.
         """
         rows = self.valid_frames()
-        errors = PathCovariance.of(self.run.read_checkpoint()[0])
+        errors = api.PathCovariance.of(self.run.read_checkpoint()[0])
         if errors is None or len(errors) <= rows[-1]:
             raise RunError(
                 f"run {self.run.path} did not record the errors of its path, because an older version made it; "
@@ -89,14 +77,14 @@ class RunReader:
         """Describe how many frames have no valid pose, of all or of the keyframes; empty if there are none."""
         log, states = self.frames.log, self.frames.states
         counted = [s for s, record in zip(states, log, strict=True) if not keyframes or record["is_keyframe"]]
-        found = [f"{counted.count(state):,} {state}" for state in (LOST, APART) if state in counted]
+        found = [f"{counted.count(state):,} {state}" for state in (api.LOST, api.APART) if state in counted]
         return f"; left out: {', '.join(found)}" if found else ""
 
     def count_keyframes(self) -> int:
         """Return the number of keyframes that `keyframes` yields."""
         return sum(bool(record["is_keyframe"]) for record in self.frames.log)
 
-    def keyframes(self) -> Iterator[tuple[int, Picture]]:
+    def keyframes(self) -> Iterator[tuple[int, api.Picture]]:
         """Yield each keyframe once, in order of time: its frame number, and its images, one at a time in memory.
 
         Raises RunError if the run kept no submaps, which contain the images.

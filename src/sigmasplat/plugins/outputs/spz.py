@@ -16,17 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    SH_C0,
-    Doubles,
-    GaussianField,
-    RunError,
-    SplatValues,
-    morton_order,
-    replacing,
-    smallest_three,
-    to_bytes,
-)
+import sigmasplat.api as api
 
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
@@ -40,33 +30,33 @@ LOG_SCALE_START, LOG_SCALE_STEPS = -10.0, 16.0
 MAGNITUDES = (1 << 9) - 1
 
 
-def write_field(path: Path, field: GaussianField) -> None:
+def write_field(path: Path, field: api.GaussianField) -> None:
     """Write the splats atomically. Raises RunError if the file cannot be written or a position is too large."""
-    values = SplatValues.of(field).turned_about_x()
-    values = values.ordered(morton_order(values.means))
+    values = api.SplatValues.of(field).turned_about_x()
+    values = values.ordered(api.morton_order(values.means))
     farthest_m = float(np.abs(values.means).max(initial=0.0))
     if not farthest_m * STEPS_PER_M <= LARGEST_FIXED:  # also if it is nan
-        raise RunError(
+        raise api.RunError(
             f"{path} cannot be written: a splat is {farthest_m:.3g} m from the origin, SPZ holds at most "
             f"{LARGEST_FIXED / STEPS_PER_M:.0f} m; the map is damaged, make it again"
         )
-    colors = (values.colors - 0.5) / SH_C0 * COLOR_SCALE + 0.5
+    colors = (values.colors - 0.5) / api.SH_C0 * COLOR_SCALE + 0.5
     streams = [
         np.round(values.means * STEPS_PER_M).astype("<i4")[..., None].view("u1")[..., :3].tobytes(),
-        to_bytes(values.opacities * 255.0).tobytes(),
-        to_bytes(colors * 255.0).tobytes(),
-        to_bytes((values.log_scales - LOG_SCALE_START) * LOG_SCALE_STEPS).tobytes(),
+        api.to_bytes(values.opacities * 255.0).tobytes(),
+        api.to_bytes(colors * 255.0).tobytes(),
+        api.to_bytes((values.log_scales - LOG_SCALE_START) * LOG_SCALE_STEPS).tobytes(),
         _packed_rotations(values.quats).tobytes(),
-        to_bytes(np.round(values.harmonics * 128.0) + 128.0).tobytes(),
+        api.to_bytes(np.round(values.harmonics * 128.0) + 128.0).tobytes(),
     ]
     header = HEADER.pack(MAGIC, WRITTEN_VERSION, len(values), values.degree, FRACTIONAL_BITS, 0, 0)
-    with replacing(path) as temporary:
+    with api.replacing(path) as temporary:
         temporary.write_bytes(gzip.compress(b"".join([header, *streams]), compresslevel=9, mtime=0))
 
 
-def _packed_rotations(quats: Doubles) -> NDArray[np.uint32]:
+def _packed_rotations(quats: api.Doubles) -> NDArray[np.uint32]:
     """Pack unit quaternions wxyz [N, 4] into words [N]."""
-    which, others = smallest_three(np.roll(quats, -1, axis=1))
+    which, others = api.smallest_three(np.roll(quats, -1, axis=1))
     word = which.astype("<u4")
     for part in others.T:
         magnitude = np.round(np.abs(part) / np.sqrt(0.5) * MAGNITUDES).astype(np.uint32)

@@ -12,21 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from sigmasplat.api import (
-    Camera,
-    FieldRenderer,
-    GaussianField,
-    Matrix,
-    Progress,
-    Render,
-    RunError,
-    SigmaSplatError,
-    Trajectory,
-    evenly_spread,
-    no_progress,
-    replacing,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Matrix, Progress, RunError, Trajectory, se3
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer
 from sigmasplat.plugins.outputs.chosen_splats import kept_below
 from sigmasplat.plugins.outputs.drawing import colormap
@@ -53,7 +40,7 @@ def smooth_path(trajectory: Trajectory, images: int, smoothing_s: float = SMOOTH
     SigmaSplatError without a pose, or unless images ≥ 1.
     """
     if not len(trajectory) or images < 1:
-        raise SigmaSplatError(f"cannot make a path of {images} images from {len(trajectory)} poses")
+        raise api.SigmaSplatError(f"cannot make a path of {images} images from {len(trajectory)} poses")
     times, first = np.unique(trajectory.timestamps_s, return_index=True)
     poses = trajectory.T_world_camera[first]
     if len(times) == 1:
@@ -116,7 +103,7 @@ def image_count(path_s: float, fps: float = 25.0, seconds: float | None = None, 
 def export_video(
     reader: RunReader, target: Path, *, width_px: int = 0, fps: float = 25.0, seconds: float | None = None,
     orbit: bool = False, panels: bool = True, up: Edge = "auto", std_below_m: float | None = None,
-    uncertain: bool = False, renderer: Renderer | None = None, progress: Progress = no_progress,
+    uncertain: bool = False, renderer: Renderer | None = None, progress: Progress = api.no_progress,
 ) -> int:  # fmt: skip
     """Write a video and return its number of images. Calls `progress(done, total)` at the start and after each image.
 
@@ -126,7 +113,7 @@ def export_video(
     path.
     """
     config, path = reader.config, reader.valid_path()
-    renderer = renderer or FieldRenderer(config.render, config.backend)
+    renderer = renderer or api.FieldRenderer(config.render, config.backend)
     film = Film.of(reader, film_camera(reader.camera, width_px), renderer, std_below_m, uncertain)
     count = image_count(float(path.timestamps_s[-1] - path.timestamps_s[0]), fps, seconds, orbit)
     if orbit:
@@ -145,7 +132,7 @@ class Film:
     seen_from: the mean directions [N, 3] that each splat was seen from; from behind it is hidden. None, [N, 0]: never.
     """
 
-    field: GaussianField
+    field: api.GaussianField
     camera: Camera
     renderer: Renderer
     seen_from: Tensor | None = None
@@ -165,7 +152,7 @@ class Film:
         seen_from = None if known is None or uncertain else known.splats[kept][:, 3:]
         return cls(field.part(kept), camera, renderer, seen_from)
 
-    def seen(self, T_world_camera: Matrix) -> Render:
+    def seen(self, T_world_camera: Matrix) -> api.Render:
         """Render the map from a pose [4, 4]."""
         field = self.field
         if self.seen_from is not None and self.seen_from.shape[1]:
@@ -174,7 +161,7 @@ class Film:
         with torch.inference_mode():
             return self.renderer(field, self.camera, se3.inverse(T_world_camera))
 
-    def images(self, poses: Matrix, panels: bool, progress: Progress = no_progress) -> Iterator[Rgb]:
+    def images(self, poses: Matrix, panels: bool, progress: Progress = api.no_progress) -> Iterator[Rgb]:
         """Yield an image for each pose [N, 4, 4]: colour, in `panels` with depth and √V beside it."""
         ranges = self._ranges(poses) if panels else None
         for done, pose in enumerate(poses, 1):
@@ -191,7 +178,7 @@ class Film:
     def _ranges(self, poses: Matrix) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the colour ranges of a whole film from a few images: the 1st to the 99th percentile of depth, and 0 to
         the 99th of √V."""
-        samples = zip(*(self._maps(pose) for pose in evenly_spread(list(poses), SAMPLES)), strict=True)
+        samples = zip(*(self._maps(pose) for pose in api.evenly_spread(list(poses), SAMPLES)), strict=True)
         _, depth_m, deviation, mapped = (np.stack(maps) for maps in samples)
         return colormap.value_range(depth_m, mapped), colormap.from_zero(deviation, mapped)
 
@@ -281,7 +268,7 @@ def write_video(path: Path, images: Iterable[Rgb], fps: float) -> None:
     """
     if path.suffix.lower() != ENDING:
         raise RunError(f"cannot write a video as {path.name}; give a name that ends in {ENDING}")
-    with replacing(path) as temporary:
+    with api.replacing(path) as temporary:
         scratch = temporary.with_suffix(ENDING)  # OpenCV selects the format by the ending
         try:
             _encode(scratch, images, fps)

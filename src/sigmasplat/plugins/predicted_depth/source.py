@@ -11,32 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.api import (
-    COLOR_ENDINGS,
-    COLOR_FOLDERS,
-    DEPTH_ENDINGS,
-    DEPTH_FOLDERS,
-    MM_PER_METRE,
-    PLAUSIBLE_MEDIAN_M,
-    VIDEO_ENDINGS,
-    Frame,
-    ImagePair,
-    InputConfig,
-    Origin,
-    RecordedSource,
-    Size,
-    Source,
-    SourceError,
-    Subset,
-    Video,
-    depth_values,
-    first_subfolder,
-    image_size,
-    list_images,
-    read_groundtruth,
-    resolve_calibration,
-    times_of_names,
-)
+import sigmasplat.api as api
+from sigmasplat.api import InputConfig, Size, Source, SourceError
 
 Floats = NDArray[np.float32]
 MEDIAN_M = 2.0
@@ -59,7 +35,7 @@ class PredictedDepth:
         if not len(known):
             raise SourceError(f"{paths[0]}: predicted depth has no value above 0; check how it was stored")
         median = float(np.median(known))
-        if inverse or not PLAUSIBLE_MEDIAN_M[0] <= median <= PLAUSIBLE_MEDIAN_M[1]:
+        if inverse or not api.PLAUSIBLE_MEDIAN_M[0] <= median <= api.PLAUSIBLE_MEDIAN_M[1]:
             self._factor = MEDIAN_M / median
 
     def depth_of(self, i: int, width: int, height: int) -> Floats:
@@ -72,7 +48,7 @@ class PredictedDepth:
 
     def _depth(self, i: int) -> Floats:
         path = self.paths[i]
-        values = depth_values(path)
+        values = api.depth_values(path)
         if values.ndim == 3 and 1 in values.shape[::2]:
             values = values[..., 0] if values.shape[2] == 1 else values[0]
         if values.ndim != 2 or values.dtype.kind not in "uif":
@@ -83,7 +59,7 @@ class PredictedDepth:
         if bad := int((~np.isfinite(read)).sum()):
             raise SourceError(f"{path}: predicted depth holds {bad} NaN or inf pixels; write 0 where it is unknown")
         if values.dtype.kind in "ui":
-            read = read / np.float32(MM_PER_METRE)
+            read = read / np.float32(api.MM_PER_METRE)
         if not self._inverse:
             return np.maximum(read, np.float32(0.0))
         usable = read > np.finfo(np.float32).tiny * 1e6
@@ -95,7 +71,7 @@ def predicted_in_folder(folder: Path, names: Sequence[str], inverse: bool) -> Pr
     order. names: those of the frames, or empty names. Raises SourceError if there is not one image for each frame."""
     if not folder.is_dir():
         raise SourceError(f"no such folder: {folder}; give the folder of the predicted depth, one image per frame")
-    found = list_images(folder, DEPTH_ENDINGS)
+    found = api.list_images(folder, api.DEPTH_ENDINGS)
     by_name = {path.stem: path for path in found}
     if names and names[0] in by_name:
         missing = [name for name in names if name not in by_name]
@@ -112,7 +88,7 @@ def predicted_in_folder(folder: Path, names: Sequence[str], inverse: bool) -> Pr
     return PredictedDepth(found, inverse)
 
 
-class WithPredictedDepth(Subset):
+class WithPredictedDepth(api.Subset):
     """Another source with predicted depth instead of its own.
 
     Raises SourceError if the depth does not fit the frames, or the source is a live camera.
@@ -126,7 +102,7 @@ class WithPredictedDepth(Subset):
         self.depth_units_per_metre = None
         _say_predicted(self)
 
-    def frame(self, i: int) -> Frame:
+    def frame(self, i: int) -> api.Frame:
         return replace(super().frame(i), depth_m=self.depth_of(i))
 
     def depth_of(self, i: int) -> Floats:
@@ -134,7 +110,7 @@ class WithPredictedDepth(Subset):
 
 
 @dataclass(frozen=True)
-class PredictedPair(ImagePair):
+class PredictedPair(api.ImagePair):
     """A colour image, or a frame of a video, and its predicted depth."""
 
     number: int
@@ -151,10 +127,13 @@ class PredictedPair(ImagePair):
 def lacks_depth(path: Path, recognised: bool) -> bool:
     """Return whether a path is a video, or a folder of colour images without depth images; recognised: whether a format
     is sure of it."""
-    if path.suffix.lower() in VIDEO_ENDINGS:
+    if path.suffix.lower() in api.VIDEO_ENDINGS:
         return path.is_file()
     return (
-        not recognised and path.is_dir() and first_subfolder(path, DEPTH_FOLDERS) is None and bool(_color_images(path))
+        not recognised
+        and path.is_dir()
+        and api.first_subfolder(path, api.DEPTH_FOLDERS) is None
+        and bool(_color_images(path))
     )
 
 
@@ -164,30 +143,30 @@ def open_color_only(path: Path, settings: InputConfig) -> Source:
     A folder may contain calibration.json and groundtruth.txt, as a plain folder. Raises SourceError if the images do
     not fit, or the camera is unknown.
     """
-    video = Video(path) if path.is_file() else None
+    video = api.Video(path) if path.is_file() else None
     if video:
         colors, size, names = [path] * video.count, video.size, [""] * video.count
-        times_s, times = np.arange(video.count) / video.frames_per_second, Origin("frame rate", f"read from {path}")
+        times_s, times = np.arange(video.count) / video.frames_per_second, api.Origin("frame rate", f"read from {path}")
     else:
         colors = _color_images(path)
-        size, names = image_size(colors[0]), [color.stem for color in colors]
-        times_s, times = times_of_names(colors)
-    calibration = resolve_calibration(path, None, size, settings, MM_PER_METRE)
+        size, names = api.image_size(colors[0]), [color.stem for color in colors]
+        times_s, times = api.times_of_names(colors)
+    calibration = api.resolve_calibration(path, None, size, settings, api.MM_PER_METRE)
     predicted = predicted_in_folder(Path(settings.predicted_depth), names, settings.predicted_inverse)
     images = [
         PredictedPair(t, color, depth, number, size, predicted, video=(video, number) if video else None)
         for number, (t, color, depth) in enumerate(zip(times_s.tolist(), colors, predicted.paths, strict=True))
     ]
-    truth = read_groundtruth(path)
+    truth = api.read_groundtruth(path)
     settings = replace(settings, depth_scale=0.0)
-    source = RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
+    source = api.RecordedSource(path.resolve().name, images, replace(calibration, depth_camera=None), settings, truth)
     source.origins["times"] = times
     _say_predicted(source)
     return source
 
 
 def _color_images(folder: Path) -> list[Path]:
-    return list_images(first_subfolder(folder, COLOR_FOLDERS) or folder, COLOR_ENDINGS)
+    return api.list_images(api.first_subfolder(folder, api.COLOR_FOLDERS) or folder, api.COLOR_ENDINGS)
 
 
 def _say_predicted(source: Source) -> None:

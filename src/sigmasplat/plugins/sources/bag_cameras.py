@@ -12,20 +12,8 @@ from itertools import islice
 
 import numpy as np
 
-from sigmasplat.api import (
-    MM_PER_METRE,
-    Calibration,
-    Camera,
-    Distortion,
-    InputConfig,
-    Matrix,
-    SourceError,
-    build_camera,
-    nearest,
-    resolve_calibration,
-    rigid_transform,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Calibration, Distortion, Matrix, SourceError, se3
 from sigmasplat.plugins.sources import bag_messages
 from sigmasplat.plugins.sources.bag_messages import COMPRESSED, RAW, Bag, ImageKind, Message, image_kind
 
@@ -56,7 +44,7 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
 def transform_of(where: str, message: Message) -> Matrix:
     """Build a transform of a geometry_msgs/Transform. Raises SourceError naming `where` unless it is rigid."""
     t, q = message.translation, message.rotation
-    return rigid_transform(where, [t.x, t.y, t.z], [q.w, q.x, q.y, q.z])
+    return api.rigid_transform(where, [t.x, t.y, t.z], [q.w, q.x, q.y, q.z])
 
 
 def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:
@@ -137,7 +125,7 @@ def topic_by_name(bag: Bag, name: str) -> ImageTopic:
     topics = {topic.name: topic for topic in bag.topics_of_type(RAW, COMPRESSED)}
     if name not in topics:
         raise SourceError(
-            f"{bag.path}: no images in topic {name}{nearest(name, list(topics))}; "
+            f"{bag.path}: no images in topic {name}{api.nearest(name, list(topics))}; "
             f"there are {bag_messages.list_topics(topics.values())}"
         )
     return _described(bag, name)
@@ -169,11 +157,11 @@ def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> I
 BROWN_CONRADY = ("", "plumb_bob", "brown conrady", "inverse brown conrady", "modified brown conrady", "none")
 RATIONAL = "rational_polynomial"
 
-Optics = tuple[Camera, Distortion | None]
+Optics = tuple[api.Camera, Distortion | None]
 """Intrinsics, and lens distortion or None."""
 
 
-def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: InputConfig) -> Calibration:
+def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, settings: api.InputConfig) -> Calibration:
     """Return the calibration of a bag; the settings override it.
 
     Raises SourceError if the colour camera is unknown, or if the pose of a separate depth camera is unknown.
@@ -183,7 +171,7 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
         optics = read_optics(bag, color)
     units = _depth_units(bag, depth)
     recorded = Calibration(optics[0], units, optics[1]) if optics else None
-    calibration = resolve_calibration(bag.path, recorded, color.size, settings, units)
+    calibration = api.resolve_calibration(bag.path, recorded, color.size, settings, units)
     decided = settings.calibration or calibration.depth_camera or settings.register_depth == "off"
     same_frame = bool(depth.frame) and depth.frame == color.frame and not sdk_stream(depth)
     if decided or depth.registered or same_frame:
@@ -215,7 +203,7 @@ def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     if k[0, 0] <= 0:
         return None
     width, height = int(info.width) or topic.size[0], int(info.height) or topic.size[1]
-    camera = build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
+    camera = api.build_camera(where, width, height, [float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])])
     return camera, None if rectified else _lens(f"{bag.path}: {name}", info)
 
 
@@ -224,9 +212,9 @@ def _depth_units(bag: Bag, depth: ImageTopic) -> float:
     sensor = "/".join(depth.name.split("/")[:3])
     name = f"{sensor}/option/Depth_Units/value"
     if name not in bag.topics or not bag.topics[name].count:
-        return MM_PER_METRE  # ROS depth as whole numbers is in millimetres (REP 118)
+        return api.MM_PER_METRE  # ROS depth as whole numbers is in millimetres (REP 118)
     metres = float(bag.first_message(name).data)
-    return round(1.0 / metres, 3) if metres > 0 else MM_PER_METRE
+    return round(1.0 / metres, 3) if metres > 0 else api.MM_PER_METRE
 
 
 def _color_depth(bag: Bag, color: ImageTopic, depth: ImageTopic) -> Matrix:

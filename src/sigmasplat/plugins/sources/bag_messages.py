@@ -17,19 +17,8 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    SourceError,
-    depth_to_metres,
-    image_size,
-    import_optional,
-    open_regular,
-    opencv,
-    read_color,
-    read_values,
-    refuse_special,
-    sqlite_tables,
-    without_nan,
-)
+import sigmasplat.api as api
+from sigmasplat.api import SourceError
 
 Message = Any
 Value = TypeVar("Value")
@@ -67,12 +56,12 @@ class Bag:
         self.path, self._lock = path, threading.Lock()
         for file in sorted(path.iterdir()) if path.is_dir() else [path]:
             if not file.is_dir():
-                refuse_special(file, most=MOST_METADATA_BYTES if file.name == METADATA else None)
+                api.refuse_special(file, most=MOST_METADATA_BYTES if file.name == METADATA else None)
         self.ros1 = path.is_file() and _magic(path).startswith(ROS1_MAGIC)
-        reader = import_optional(
+        reader = api.import_optional(
             "rosbags.rosbag1" if self.ros1 else "rosbags.rosbag2", "ros", f"{path}: a ROS bag"
         ).Reader
-        typesys = import_optional("rosbags.typesys", "ros", f"{path}: a ROS bag")
+        typesys = api.import_optional("rosbags.typesys", "ros", f"{path}: a ROS bag")
         # The common message types never changed; the type definitions stored in a bag are not needed and may be wrong.
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.ros1 else typesys.Stores.LATEST)
         if TRANSFORMS not in self._types.fielddefs:
@@ -158,10 +147,10 @@ def is_bag(path: Path) -> bool:
         metadata = path / METADATA
         if not metadata.is_file():
             return False
-        with open_regular(metadata) as file:
+        with api.open_regular(metadata) as file:
             return b"rosbag2_bagfile_information" in file.read(4096)
     known = path.is_file() and _magic(path).startswith((ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC))
-    return known and (not (tables := sqlite_tables(path)) or {"topics", "messages"} <= tables)
+    return known and (not (tables := api.sqlite_tables(path)) or {"topics", "messages"} <= tables)
 
 
 def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
@@ -171,7 +160,7 @@ def list_topics(topics: Iterable[Topic], most: int = 12) -> str:
 
 
 def _magic(path: Path) -> bytes:
-    with open_regular(path) as file:
+    with api.open_regular(path) as file:
         return file.read(16)
 
 
@@ -207,14 +196,14 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
         return int(message.width), int(message.height)
     data = message.data.tobytes()
     start = HEADER_BYTES if "compressedDepth" in message.format else 0
-    return image_size(path, data[start:])
+    return api.image_size(path, data[start:])
 
 
 def decode_color_message(path: Path, message: Message) -> NDArray[Any]:
     """Return 8-bit RGB [H, W, 3], or gray of more bits [H, W], as `read_color`. Raises SourceError naming `path` if the
     message is damaged or not colour."""
     if not hasattr(message, "encoding"):
-        return read_color(path, message.data.tobytes())
+        return api.read_color(path, message.data.tobytes())
     wide, name = "16" in message.encoding, message.encoding.replace("16", "8")
     if name not in COLOR_FORMS:
         raise _encoding(path, "colour", message.encoding, COLOR_FORMS)
@@ -224,7 +213,7 @@ def decode_color_message(path: Path, message: Message) -> NDArray[Any]:
         return stored[..., 0]
     pixels = (stored >> (8 * wide)).astype(np.uint8)
     if isinstance(order, str):
-        return np.asarray(opencv().cvtColor(pixels, getattr(opencv(), order)), np.uint8)
+        return np.asarray(api.opencv().cvtColor(pixels, getattr(api.opencv(), order)), np.uint8)
     return np.ascontiguousarray(pixels[..., order])
 
 
@@ -238,7 +227,7 @@ def decode_depth_message(path: Path, message: Message, units_per_metre: float) -
     if message.encoding not in DEPTH_TYPE:
         raise _encoding(path, "depth", message.encoding, DEPTH_TYPE)
     raw = _pixels(path, message, DEPTH_TYPE[message.encoding], 1)[..., 0]
-    return depth_to_metres(path, without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
+    return api.depth_to_metres(path, api.without_nan(raw) if raw.dtype.kind == "f" else raw, units_per_metre)
 
 
 def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
@@ -246,12 +235,12 @@ def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArr
         raise SourceError(f"{path}: depth is compressed as RVL, which is not supported; republish it as PNG or raw")
     data = message.data.tobytes()
     has_header = "compressedDepth" in message.format
-    raw = read_values(path, data[HEADER_BYTES * has_header :])
+    raw = api.read_values(path, data[HEADER_BYTES * has_header :])
     if not (has_header and message.format.startswith("32FC1")):
-        return depth_to_metres(path, raw, units_per_metre)
+        return api.depth_to_metres(path, raw, units_per_metre)
     a, b = struct.unpack_from("<ff", data, 4)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return depth_to_metres(path, without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
+        return api.depth_to_metres(path, api.without_nan(np.where(raw > 0, a / (raw - b), 0.0)), units_per_metre)
 
 
 def _pixels(path: Path, message: Message, kind: str, channels: int) -> NDArray[Any]:

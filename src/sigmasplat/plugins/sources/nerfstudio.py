@@ -28,34 +28,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Fields,
-    ImagePair,
-    InputConfig,
-    Origin,
-    RecordedSource,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    build_trajectory,
-    check_positive,
-    checked_pose,
-    first_size,
-    folder_source,
-    json_number,
-    list_images,
-    listed_file,
-    natural_key,
-    parse_numbers,
-    read_frames,
-    read_json_object,
-    read_lines,
-    read_pose,
-    read_transforms_camera,
-    se3,
-    seconds_of,
-    times_of_names,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Fields, InputConfig, RecordedSource, SourceError, SourceFormat, se3
 
 NAME = "transforms.json"
 UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
@@ -66,13 +40,13 @@ DEPTH, METRES_PER_UNIT = "depth_file_path", 0.001
 def open_nerfstudio(place: str, settings: InputConfig) -> RecordedSource:
     """Open a folder with depth. Raises SourceError if its JSON file, images or camera cannot be used."""
     path = Path(place) / NAME
-    return _open(path.parent, path, read_json_object(path), settings)
+    return _open(path.parent, path, api.read_json_object(path), settings)
 
 
 def _open(
-    folder: Path, path: Path, fields: Fields, settings: InputConfig, by: str = NAME, truth: Trajectory | None = None
+    folder: Path, path: Path, fields: Fields, settings: InputConfig, by: str = NAME, truth: api.Trajectory | None = None
 ) -> RecordedSource:
-    named = sorted(read_frames(path, fields), key=lambda frame: natural_key(frame["file_path"]))
+    named = sorted(api.read_frames(path, fields), key=lambda frame: api.natural_key(frame["file_path"]))
     named = [frame | {DEPTH: frame.get(DEPTH, frame.get("depth_path"))} for frame in named]
     frames = [frame for frame in named if isinstance(frame[DEPTH], str)]
     if not frames:
@@ -81,22 +55,22 @@ def _open(
             "export depth with the images, see docs/data.md#without-depth"
         )
     skipped = [f"{path}: {frame['file_path']} has no {DEPTH}" for frame in named if not isinstance(frame[DEPTH], str)]
-    files, read = [_files(folder, frame) for frame in frames], Origin("", f"read from {path}")
-    times_s, times = times_of_names([color for color, _ in files])
+    files, read = [_files(folder, frame) for frame in frames], api.Origin("", f"read from {path}")
+    times_s, times = api.times_of_names([color for color, _ in files])
     found = [frame.get("timestamp") for frame in frames]
     stamps = np.array([stamp if isinstance(stamp, int | float) else np.nan for stamp in found])
-    if (stamps_s := seconds_of(stamps, bool((stamps % 1).any()))) is not None:
+    if (stamps_s := api.seconds_of(stamps, bool((stamps % 1).any()))) is not None:
         times_s, times = stamps_s, read._replace(value="timestamp of each frame")
     order = np.argsort(times_s)
     frames, files, times_s = [frames[i] for i in order], [files[i] for i in order], times_s[order]
-    sure = [listed_file(folder, name) if isinstance(name := f.get("confidence"), str) else None for f in frames]
-    images = [ImagePair(float(t), *pair, confidence=c) for t, pair, c in zip(times_s, files, sure, strict=True)]
+    sure = [api.listed_file(folder, name) if isinstance(name := f.get("confidence"), str) else None for f in frames]
+    images = [api.ImagePair(float(t), *pair, confidence=c) for t, pair, c in zip(times_s, files, sure, strict=True)]
     key = next((key for key in UNIT_KEYS if key in fields), "")
-    units = round(1.0 / check_positive(path, key, json_number(path, fields, key, METRES_PER_UNIT)), 6)
-    known = read_transforms_camera(path, fields, frames, first_size([i.color for i in images]), units)
+    units = round(1.0 / api.check_positive(path, key, api.json_number(path, fields, key, METRES_PER_UNIT)), 6)
+    known = api.read_transforms_camera(path, fields, frames, api.first_size([i.color for i in images]), units)
     known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
-    truth = truth or build_trajectory(zip(times_s, (read_pose(path, frame) for frame in frames), strict=True))
-    return folder_source(
+    truth = truth or api.build_trajectory(zip(times_s, (api.read_pose(path, frame) for frame in frames), strict=True))
+    return api.folder_source(
         folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=by,
         origins={"times": times, "pairs": read._replace(value="named in each frame")},
     )  # fmt: skip
@@ -104,7 +78,7 @@ def _open(
 
 def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
     """Return the colour and the depth file of a frame; instant-ngp omits the file ending of colour."""
-    color, depth = (listed_file(folder, frame[key]) for key in ("file_path", DEPTH))
+    color, depth = (api.listed_file(folder, frame[key]) for key in ("file_path", DEPTH))
     bare = not color.suffix and not color.is_file()
     return (color.with_suffix(".png") if bare else color), depth
 
@@ -114,8 +88,8 @@ def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
     folder = _keyframes(place)
     kind = "corrected_" if all((folder / f"corrected_{part}").is_dir() for part in ("cameras", "images")) else ""
     frames = []
-    for path in list_images(folder / f"{kind}cameras", (".json",)):
-        number = partial(json_number, path, read_json_object(path))
+    for path in api.list_images(folder / f"{kind}cameras", (".json",)):
+        number = partial(api.json_number, path, api.read_json_object(path))
         frame: Fields = {"file_path": f"{kind}images/{path.stem}.jpg", DEPTH: f"depth/{path.stem}.png"}
         frame |= {"confidence": f"confidence/{path.stem}.png"}
         frame |= {"fl_x": number("fx"), "fl_y": number("fy"), "w": number("width"), "h": number("height")}
@@ -130,10 +104,10 @@ def open_3d_scanner_app(place: str, settings: InputConfig) -> RecordedSource:
     folder, frames = Path(place), list[Fields]()
     for path in sorted(folder.glob("frame_*.json")):
         if path.with_suffix(".jpg").is_file():
-            fields, number = read_json_object(path), path.stem.removeprefix("frame_")
+            fields, number = api.read_json_object(path), path.stem.removeprefix("frame_")
             flat = fields.get("intrinsics")
             K = {f"intrinsics, number {i}": n for i, n in enumerate(flat)} if isinstance(flat, list) else {}
-            fx, cx, fy, cy = (json_number(path, K, f"intrinsics, number {i}") for i in (0, 2, 4, 5))
+            fx, cx, fy, cy = (api.json_number(path, K, f"intrinsics, number {i}") for i in (0, 2, 4, 5))
             frame: Fields = {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "timestamp": fields.get("time")}
             frame |= {"file_path": f"{path.stem}.jpg", DEPTH: f"depth_{number}.png", "confidence": f"conf_{number}.png"}
             frames.append(frame | {"transform_matrix": fields.get("cameraPoseARFrame")})
@@ -144,11 +118,11 @@ def open_arkitscenes(place: str, settings: InputConfig) -> RecordedSource:
     """Open the folder of a video. Raises SourceError as `open_nerfstudio`."""
     folder, frames = _video(place), list[Fields]()
     names, cameras = folder / "lowres_wide", folder / "lowres_wide_intrinsics"
-    colors, pincams = list_images(names, (".png",)), list_images(cameras, (".pincam",))
+    colors, pincams = api.list_images(names, (".png",)), api.list_images(cameras, (".pincam",))
     if not colors or not pincams:
         raise SourceError(f"{folder}: no .png in {names.name} or no .pincam in {cameras.name}; download both")
-    times_s, path = times_of_names(pincams)[0], folder / "lowres_wide.traj"
-    nearest = np.searchsorted((times_s[1:] + times_s[:-1]) / 2, times_of_names(colors)[0])
+    times_s, path = api.times_of_names(pincams)[0], folder / "lowres_wide.traj"
+    nearest = np.searchsorted((times_s[1:] + times_s[:-1]) / 2, api.times_of_names(colors)[0])
     for name, i in zip((color.name for color in colors), nearest, strict=True):
         numbers = _rows(pincams[i], 6)[0] - [0, 0, 0, 0, -0.5, -0.5]
         frame: Fields = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers.tolist(), strict=True))
@@ -157,14 +131,14 @@ def open_arkitscenes(place: str, settings: InputConfig) -> RecordedSource:
     rows = _rows(path, 7) if path.is_file() else np.zeros((0, 7))
     T_camera_world = se3.exp_stack(np.pad(rows[:, 1:4], ((0, 0), (3, 0))))
     T_camera_world[:, :3, 3] = rows[:, 4:]
-    poses = [checked_pose(str(path), T) for T in se3.inverse(T_camera_world)]
-    truth = build_trajectory(zip(rows[:, 0], poses, strict=True))
+    poses = [api.checked_pose(str(path), T) for T in se3.inverse(T_camera_world)]
+    truth = api.build_trajectory(zip(rows[:, 0], poses, strict=True))
     return _open(folder, cameras, {"frames": frames}, settings, "ARKit", truth)
 
 
 def _rows(path: Path, count: int) -> NDArray[np.float64]:
     """Read lines of so many numbers [N, count]. Raises SourceError naming the file if there is none, or another."""
-    rows = [parse_numbers(path, line, words) for line, words in read_lines(path)]
+    rows = [api.parse_numbers(path, line, words) for line, words in api.read_lines(path)]
     if (found := {len(row) for row in rows}) != {count}:
         raise SourceError(f"{path}: expected lines of {count} numbers, found {sorted(found)}; download it again")
     return np.array(rows)

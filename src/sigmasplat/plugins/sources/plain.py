@@ -23,51 +23,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    ASSUMED,
-    ASSUMED_TIMES,
-    COLOR_ENDINGS,
-    COLOR_FOLDERS,
-    DEPTH_ENDINGS,
-    DEPTH_FOLDERS,
-    FRAMES_PER_SECOND,
-    MM_PER_METRE,
-    NAMED,
-    Calibration,
-    Camera,
-    ImagePair,
-    InputConfig,
-    Origin,
-    RecordedSource,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    build_camera,
-    build_trajectory,
-    check_positive,
-    checked_pose,
-    first_file,
-    first_size,
-    first_subfolder,
-    folder_source,
-    index_by_number,
-    intrinsics_beside,
-    json_number,
-    list_images,
-    numbered_pairs,
-    open_regular,
-    pair_images,
-    pair_times,
-    parse_numbers,
-    published,
-    read_groundtruth,
-    read_json_object,
-    read_lines,
-    time_origins,
-    times_of_names,
-    to_matrix,
-    without_depth,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Calibration, ImagePair, InputConfig, Origin, RecordedSource, SourceError, SourceFormat
 
 NAMES = "color|rgb|images/*", "depth/*"
 REMEDY = "write rgb.txt and depth.txt with 'time path' lines, or give each pair the same name"
@@ -76,13 +33,13 @@ REMEDY = "write rgb.txt and depth.txt with 'time path' lines, or give each pair 
 def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images cannot be paired or the camera is unknown."""
     folder = Path(path)
-    depth_folder = first_subfolder(folder, DEPTH_FOLDERS)
-    if depth_folder is None and (problem := without_depth(folder)):
+    depth_folder = api.first_subfolder(folder, api.DEPTH_FOLDERS)
+    if depth_folder is None and (problem := api.without_depth(folder)):
         raise problem
-    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    images, skipped, origins = _pairs(folder, colors, list_images(depth_folder, DEPTH_ENDINGS), settings)
-    truth = read_groundtruth(folder)
-    return folder_source(folder, settings, images, None, MM_PER_METRE, truth, skipped, origins=origins)
+    colors = api.list_images(api.first_subfolder(folder, api.COLOR_FOLDERS), api.COLOR_ENDINGS)
+    images, skipped, origins = _pairs(folder, colors, api.list_images(depth_folder, api.DEPTH_ENDINGS), settings)
+    truth = api.read_groundtruth(folder)
+    return api.folder_source(folder, settings, images, None, api.MM_PER_METRE, truth, skipped, origins=origins)
 
 
 Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
@@ -91,27 +48,27 @@ Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
 
 def _pairs(folder: Path, colors: list[Path], depths: list[Path], settings: InputConfig) -> Found:
     """Pair images by the times in their names, else by name, by number, or by order if names do no more than count."""
-    (color_s, read), (depth_s, depth_read) = times_of_names(colors), times_of_names(depths)
-    timed = [read.origin, depth_read.origin].count(NAMED)
+    (color_s, read), (depth_s, depth_read) = api.times_of_names(colors), api.times_of_names(depths)
+    timed = [read.origin, depth_read.origin].count(api.NAMED)
     if timed == 2:
         return _timed_pairs(folder, colors, depths, settings, color_s, depth_s)
-    found, skipped, how = list(zip(colors, depths, strict=False)), list[str](), Origin("by order", ASSUMED, REMEDY)
+    found, skipped, how = list(zip(colors, depths, strict=False)), list[str](), Origin("by order", api.ASSUMED, REMEDY)
     by_name = [{path.stem: path for path in paths} for paths in (colors, depths)]
-    by_number = [{str(n): path for n, path in index_by_number(paths).items()} for paths in (colors, depths)]
+    by_number = [{str(n): path for n, path in api.index_by_number(paths).items()} for paths in (colors, depths)]
     for way, (color_of, depth_of) in {"by name": by_name, "by number": by_number}.items():
         unique = way == "by name" or (len(color_of) + len(depth_of) == len(colors) + len(depths) and not timed)
         if not colors or not depths or (unique and color_of.keys() & depth_of.keys()):
-            keys, skipped = pair_images(folder, color_of, depth_of, *NAMES)
-            found, how = [(color_of[key], depth_of[key]) for key in keys], Origin(way, NAMED)
+            keys, skipped = api.pair_images(folder, color_of, depth_of, *NAMES)
+            found, how = [(color_of[key], depth_of[key]) for key in keys], Origin(way, api.NAMED)
             break
     else:
-        steps = [set(np.diff([*index_by_number(paths)]).tolist()) for paths in (colors, depths)]
+        steps = [set(np.diff([*api.index_by_number(paths)]).tolist()) for paths in (colors, depths)]
         if len(colors) != len(depths) or max(map(len, steps)) > 1 or timed:
             raise SourceError(
                 f"{folder}: {len(colors)} colour and {len(depths)} depth images have no name, time or number in common "
                 f"(found {colors[0].name} and {depths[0].name}); {REMEDY}"
             )
-    times_s, times = times_of_names([color for color, _ in found])
+    times_s, times = api.times_of_names([color for color, _ in found])
     images = [ImagePair(t, *pair) for t, pair in zip(times_s.tolist(), found, strict=True)]
     return images, skipped, {"times": times, "pairs": how}
 
@@ -121,16 +78,18 @@ def _timed_pairs(
     color_s: NDArray[np.float64], depth_s: NDArray[np.float64],
 ) -> Found:  # fmt: skip
     depth_s = depth_s - settings.depth_delay_s
-    pairs, alone = pair_times(folder, {"colour": color_s, "depth": depth_s}, settings)
+    pairs, alone = api.pair_times(folder, {"colour": color_s, "depth": depth_s}, settings)
     late_s = {(i, j): float(depth_s[j] - color_s[i]) for i, j in pairs}
     images = [ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=s) for (i, j), s in late_s.items()]
-    times = Origin(f"{color_s.min():.3f} … {color_s.max():.3f} s", NAMED)
-    origins = {"times": times} | time_origins(settings, "by time", NAMED)
+    times = Origin(f"{color_s.min():.3f} … {color_s.max():.3f} s", api.NAMED)
+    origins = {"times": times} | api.time_origins(settings, "by time", api.NAMED)
     return images, [f"{colors[i]}: no depth within {settings.max_gap_s:g} s" for i in alone], origins
 
 
 INTRINSIC_NAMES = ("intrinsic.json", "intrinsics.json", "camera_intrinsic.json", "camera_intrinsics.json")
-PRIMESENSE = published("PrimeSense's factory values", Camera(640, 480, 525.0, 525.0, 319.5, 239.5), MM_PER_METRE)
+PRIMESENSE = api.published(
+    "PrimeSense's factory values", api.Camera(640, 480, 525.0, 525.0, 319.5, 239.5), api.MM_PER_METRE
+)
 """Open3D's PrimeSenseDefault."""
 
 _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
@@ -139,50 +98,56 @@ _TIMED = re.compile(r"([0-9]+)-([0-9]{9,})")
 def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images, camera or trajectory cannot be used."""
     folder = Path(path)
-    file = first_file(folder, INTRINSIC_NAMES)
-    fields = read_json_object(file) if file else {}
-    rate = check_positive(file or folder, "fps", json_number(file or folder, fields, "fps", FRAMES_PER_SECOND))
-    colors = list_images(first_subfolder(folder, COLOR_FOLDERS), COLOR_ENDINGS)
-    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    file = api.first_file(folder, INTRINSIC_NAMES)
+    fields = api.read_json_object(file) if file else {}
+    rate = api.check_positive(
+        file or folder, "fps", api.json_number(file or folder, fields, "fps", api.FRAMES_PER_SECOND)
+    )
+    colors = api.list_images(api.first_subfolder(folder, api.COLOR_FOLDERS), api.COLOR_ENDINGS)
+    depths = api.list_images(folder / "depth", api.DEPTH_ENDINGS)
     if colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths):
         stamps = [np.array([int(p.stem.split("-")[1]) * 1e-6 for p in paths]) for paths in (colors, depths)]
         images, skipped, origins = _timed_pairs(folder, colors, depths, settings, *stamps)
         images = [replace(i, timestamp_s=i.timestamp_s + i.depth_late_s) for i in images]  # poses are those of depth
-    elif NAMED in (times_of_names(colors)[1].origin, times_of_names(depths)[1].origin):
+    elif api.NAMED in (api.times_of_names(colors)[1].origin, api.times_of_names(depths)[1].origin):
         images, skipped, origins = _pairs(folder, colors, depths, settings)
     else:
-        names = f"{'|'.join(COLOR_FOLDERS)}/*.jpg", "depth/*.png"
-        numbered, skipped = numbered_pairs(folder, index_by_number(colors), index_by_number(depths), *names, rate)
-        times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else ASSUMED_TIMES
-        images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", NAMED)}
-    size = first_size([image.color for image in images])
-    beside = None if "intrinsic_matrix" in fields else intrinsics_beside(folder, settings, size, MM_PER_METRE)
+        names = f"{'|'.join(api.COLOR_FOLDERS)}/*.jpg", "depth/*.png"
+        numbered, skipped = api.numbered_pairs(
+            folder, api.index_by_number(colors), api.index_by_number(depths), *names, rate
+        )
+        times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else api.ASSUMED_TIMES
+        images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", api.NAMED)}
+    size = api.first_size([image.color for image in images])
+    beside = None if "intrinsic_matrix" in fields else api.intrinsics_beside(folder, settings, size, api.MM_PER_METRE)
     known = beside or (_recorded(file, fields) if file else PRIMESENSE)
     truth = _truth(folder, images)
-    return folder_source(folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins)
+    return api.folder_source(
+        folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins
+    )
 
 
 def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
     values = fields.get("intrinsic_matrix")
     if not isinstance(values, list) or len(values) != 9:
         raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
-    fx, fy, cx, cy = (json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
-    width, height = (int(json_number(path, fields, key)) for key in ("width", "height"))
-    units = check_positive(path, "depth_scale", json_number(path, fields, "depth_scale", MM_PER_METRE))
+    fx, fy, cx, cy = (api.json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
+    width, height = (int(api.json_number(path, fields, key)) for key in ("width", "height"))
+    units = api.check_positive(path, "depth_scale", api.json_number(path, fields, "depth_scale", api.MM_PER_METRE))
     read = Origin("", f"read from {path.name}")
     origins = {"camera": read} | ({"depth unit": read} if "depth_scale" in fields else {})
-    return Calibration(build_camera(path, width, height, [fx, fy, cx, cy]), units, origins=origins)
+    return Calibration(api.build_camera(path, width, height, [fx, fy, cx, cy]), units, origins=origins)
 
 
-def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
+def _truth(folder: Path, images: list[ImagePair]) -> api.Trajectory | None:
     """Read the log; the first number of a pose is the index of its depth image, from 0."""
     path = _log_in(folder)
     if path is None:
         return None
-    rows = [(line, parse_numbers(path, line, words)) for line, words in read_lines(path)]
+    rows = [(line, api.parse_numbers(path, line, words)) for line, words in api.read_lines(path)]
     if len(rows) % 5 or any(len(row) != (3 if i % 5 == 0 else 4) for i, (_, row) in enumerate(rows)):
         raise SourceError(f"{path}: each pose needs 5 lines: three numbers, then 4 rows of 4; is the file truncated?")
-    depths = list_images(folder / "depth", DEPTH_ENDINGS)
+    depths = api.list_images(folder / "depth", api.DEPTH_ENDINGS)
     times = {image.depth: image.timestamp_s for image in images}
     timed = []
     for start in range(0, len(rows), 5):
@@ -190,8 +155,10 @@ def _truth(folder: Path, images: list[ImagePair]) -> Trajectory | None:
         time = times.get(depths[int(index)]) if 0 <= index < len(depths) else None
         if time is not None:
             where = f"{path}:{line}"
-            timed.append((time, checked_pose(where, to_matrix(where, [row for _, row in rows[start + 1 : start + 5]]))))
-    return build_trajectory(timed)
+            timed.append(
+                (time, api.checked_pose(where, api.to_matrix(where, [row for _, row in rows[start + 1 : start + 5]])))
+            )
+    return api.build_trajectory(timed)
 
 
 def _log_in(folder: Path) -> Path | None:
@@ -205,18 +172,18 @@ def _log_in(folder: Path) -> Path | None:
 def _begins_as_trajectory(path: Path) -> bool:
     if not path.is_file():
         return False
-    with open_regular(path) as file:
+    with api.open_regular(path) as file:
         words = file.readline(200).decode("utf-8", "replace").split()
     return len(words) == 3 and all(word.isdecimal() for word in words)
 
 
 def _is_redwood(path: str) -> bool:
     folder = Path(path)
-    colors = first_subfolder(folder, COLOR_FOLDERS)
+    colors = api.first_subfolder(folder, api.COLOR_FOLDERS)
     if colors is None and not (folder / "depth").is_dir():
         return False
     timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
-    return timed or first_file(folder, INTRINSIC_NAMES) is not None or _log_in(folder) is not None
+    return timed or api.first_file(folder, INTRINSIC_NAMES) is not None or _log_in(folder) is not None
 
 
 PLUGIN = (
@@ -226,6 +193,7 @@ PLUGIN = (
     ),
     SourceFormat(
         "plain folder", "color/ (or rgb/, images/) and depth/",
-        lambda path: first_subfolder(Path(path), (*COLOR_FOLDERS, *DEPTH_FOLDERS)) is not None, open_plain, priority=-1,
+        lambda path: api.first_subfolder(Path(path), (*api.COLOR_FOLDERS, *api.DEPTH_FOLDERS)) is not None,
+        open_plain, priority=-1,
     ),
 )  # fmt: skip

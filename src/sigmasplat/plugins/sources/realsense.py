@@ -14,20 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from sigmasplat.api import (
-    Calibration,
-    Camera,
-    Distortion,
-    Frame,
-    InputConfig,
-    Rectification,
-    SourceError,
-    SourceFormat,
-    color_from_bytes,
-    import_optional,
-    resized_color,
-    resolve_calibration,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Frame, InputConfig, SourceError
 from sigmasplat.plugins.sources.live import LiveSource
 
 OPTIONS = {"width": 640, "height": 480, "fps": 30}
@@ -44,9 +32,9 @@ class RealSense(LiveSource):
         color = profile.get_stream(sdk.stream.color).as_video_stream_profile()
         camera, lens = _optics(sdk, color.get_intrinsics())
         units = round(1.0 / float(profile.get_device().first_depth_sensor().get_depth_scale()), 3)
-        recorded, size = Calibration(camera, units, lens), (camera.width, camera.height)
-        calibration = resolve_calibration(Path("realsense"), recorded, size, settings, units)
-        self._rectified = Rectification("realsense", calibration, replace(settings, register_depth="off"))
+        recorded, size = api.Calibration(camera, units, lens), (camera.width, camera.height)
+        calibration = api.resolve_calibration(Path("realsense"), recorded, size, settings, units)
+        self._rectified = api.Rectification("realsense", calibration, replace(settings, register_depth="off"))
         super().__init__("realsense", self._rectified.camera, settings)
         self._units = calibration.depth_units_per_metre
         self.depth_units_per_metre, self._align, self._pipeline = self._units, sdk.align(sdk.stream.color), pipeline
@@ -66,10 +54,10 @@ class RealSense(LiveSource):
                 number = color.get_frame_number()
                 self.dropped += max(number - last - 1, 0) if last is not None else 0
                 last = number
-                pixels = color_from_bytes(np.array(color.get_data(), np.uint8))
+                pixels = api.color_from_bytes(np.array(color.get_data(), np.uint8))
                 units = np.asarray(depth.get_data()).astype(np.float32)
                 rgb, depth_m = self._rectified(pixels, units / np.float32(self._units))
-                rgb = resized_color(rgb, self.camera.width, self.camera.height)
+                rgb = api.resized_color(rgb, self.camera.width, self.camera.height)
                 yield Frame(index, float(color.get_timestamp()) / 1000.0, rgb, depth_m, self.camera)
                 index += 1
         finally:
@@ -92,7 +80,7 @@ class RealSense(LiveSource):
 def open_realsense(text: str, settings: InputConfig) -> RealSense:
     """Start the camera. Raises SourceError if the SDK or camera is missing, or the stream mode is not supported."""
     options = _parsed(text)
-    sdk = import_optional("pyrealsense2", "realsense", "the RealSense camera")
+    sdk = api.import_optional("pyrealsense2", "realsense", "the RealSense camera")
     pipeline, wanted = sdk.pipeline(), sdk.config()
     if options["serial"]:
         wanted.enable_device(options["serial"])
@@ -124,7 +112,7 @@ def _parsed(text: str) -> dict[str, Any]:
     return options
 
 
-def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
+def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, api.Distortion | None]:
     """Return intrinsics and distortion in OpenCV's order; the SDK's three Brown–Conrady models are equal (rsutil.h)."""
     i = intrinsics
     camera = Camera(i.width, i.height, i.fx, i.fy, i.ppx, i.ppy)
@@ -139,7 +127,7 @@ def _optics(sdk: Any, intrinsics: Any) -> tuple[Camera, Distortion | None]:
     return camera, values
 
 
-PLUGIN = SourceFormat(
+PLUGIN = api.SourceFormat(
     "RealSense", "the word 'realsense', for the camera", lambda path: path.partition(":")[0] == "realsense",
     open_realsense,
 )  # fmt: skip

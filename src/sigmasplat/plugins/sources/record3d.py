@@ -21,32 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    DAMAGED,
-    FLIP_YZ,
-    MOST_JSON_BYTES,
-    Calibration,
-    ImagePair,
-    InputConfig,
-    RecordedSource,
-    Size,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    check_positive,
-    depth_to_metres,
-    first_readable,
-    folder_source,
-    guarded,
-    import_optional,
-    json_number,
-    median_calibration,
-    parse_json,
-    read_bytes,
-    read_color,
-    rigid_transform,
-    without_nan,
-)
+import sigmasplat.api as api
+from sigmasplat.api import ImagePair, Size, SourceError, Trajectory
 
 MOST_MEMBER_BYTES = 128 << 20
 """Largest file of an archive after unzipping: an image, or its depth."""
@@ -61,7 +37,7 @@ class Archive:
         if path.is_dir():
             self.names = [str(entry.relative_to(path)) for part in ("*", "*/*") for entry in path.glob(part)]
             return
-        with guarded(path, "copy it again", SourceError, "not a complete zip archive"):
+        with api.guarded(path, "copy it again", SourceError, "not a complete zip archive"):
             self._zip = zipfile.ZipFile(path)
         listed = self._zip.namelist()
         self._inner = next((n.removesuffix("metadata") for n in listed if n.endswith("/metadata")), "")
@@ -72,9 +48,9 @@ class Archive:
         than `most` bytes."""
         where = self.path / name
         if self._zip is None:
-            return read_bytes(where, SourceError, most)
+            return api.read_bytes(where, SourceError, most)
         failed = "cannot be read from its archive"
-        with guarded(where, "copy it again", SourceError, failed), self._zip.open(self._inner + name) as member:
+        with api.guarded(where, "copy it again", SourceError, failed), self._zip.open(self._inner + name) as member:
             data = member.read(most + 1)
         if len(data) > most:
             raise SourceError(f"{where}: unzips to more than {most / 1e6:.0f} MB; is it the right file?")
@@ -96,15 +72,15 @@ class R3dImagePair(ImagePair):
     lzfse: Any
 
     def read_color(self) -> NDArray[np.uint8]:
-        return read_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
+        return api.read_color(self.color, self.archive.read(f"rgbd/{self.number}.jpg"))
 
     def read_depth(self, units_per_metre: float) -> NDArray[np.float32]:
         """Read depth in metres [H, W], 0 at confidence 0. Raises SourceError naming the member."""
-        depth_m = without_nan(self._unpacked("depth", np.float32))
+        depth_m = api.without_nan(self._unpacked("depth", np.float32))
         name = f"rgbd/{self.number}.conf"
         if name in self.archive.names:
             depth_m = np.where(self._unpacked("conf", np.uint8) > 0, depth_m, np.float32(0.0))
-        return depth_to_metres(self.depth, depth_m, units_per_metre)
+        return api.depth_to_metres(self.depth, depth_m, units_per_metre)
 
     def sizes(self) -> tuple[Size, Size]:
         height, width = self.read_color().shape[:2]
@@ -121,12 +97,12 @@ class R3dImagePair(ImagePair):
             ) from error
 
 
-def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
+def open_record3d(place: str, settings: api.InputConfig) -> api.RecordedSource:
     """Open a .r3d file, packed or unpacked, or an export. Raises SourceError if metadata or images cannot be used."""
     path = _packed(Path(place))
     archive = Archive(path)
     name = "metadata.json" if "metadata.json" in archive.names else "metadata"
-    metadata = parse_json(archive.read(name, MOST_JSON_BYTES), path / name)
+    metadata = api.parse_json(archive.read(name, api.MOST_JSON_BYTES), path / name)
     if not isinstance(metadata, dict):
         raise SourceError(f"{path / name}: holds a {type(metadata).__name__}, not an object with K, w, h")
     native = archive.by_number("rgbd", "depth")
@@ -142,30 +118,32 @@ def open_record3d(place: str, settings: InputConfig) -> RecordedSource:
     pairs = [(float(t), path / colors[n], path / depths[n]) for t, n in zip(times_s, numbers, strict=True)]
     images: Sequence[ImagePair] = [ImagePair(*pair) for pair in pairs]
     if native:
-        lzfse = import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
+        lzfse = api.import_optional("lzfse", "iphone", f"{path}: depth of Record3D")
         size = _depth_size(path / name, metadata)
         images = [R3dImagePair(*pair, archive, n, size, lzfse) for pair, n in zip(pairs, numbers, strict=True)]
     known = _calibration(path / name, metadata, images, numbers)
     skipped = [f"{path / colors[n]}: no depth image {n}" for n in sorted(colors.keys() - depths.keys())]
     truth = _truth(path / name, metadata, numbers, times_s)
-    return folder_source(
+    return api.folder_source(
         path, settings, images, known, 1.0, truth, skipped, path.resolve().stem, one_camera=True, estimated="ARKit"
     )
 
 
 def _depth_size(path: Path, metadata: dict[str, Any]) -> Size:
     """Return (width, height) of depth; older files lack it and have the LiDAR's 256×192, rotated like colour."""
-    width, height = (int(json_number(path, metadata, key)) for key in ("w", "h"))
+    width, height = (int(api.json_number(path, metadata, key)) for key in ("w", "h"))
     wide = (256, 192) if width > height else (192, 256)
-    return int(json_number(path, metadata, "dw", wide[0])), int(json_number(path, metadata, "dh", wide[1]))
+    return int(api.json_number(path, metadata, "dw", wide[0])), int(api.json_number(path, metadata, "dh", wide[1]))
 
 
 def _calibration(
     where: Path, metadata: dict[str, Any], images: Sequence[ImagePair], numbers: list[int]
-) -> Calibration | None:
+) -> api.Calibration | None:
     """Read the camera, scaled to the image size, which is larger in exports than in the metadata."""
-    size, _ = first_readable(images, lambda pair: pair.sizes())
-    width, height = (int(json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True))
+    size, _ = api.first_readable(images, lambda pair: pair.sizes())
+    width, height = (
+        int(api.json_number(where, metadata, key, value)) for key, value in zip(("w", "h"), size, strict=True)
+    )
     focal = _rows(where, metadata, "perFrameIntrinsicCoeffs", 4)
     if focal is None:
         k = _rows(where, {"K": [metadata.get("K")]}, "K", 9) if metadata.get("K") else None
@@ -173,15 +151,15 @@ def _calibration(
     if focal is None:
         return None
     focal = focal[numbers] if len(focal) > numbers[-1] else focal[:1].repeat(len(numbers), 0)
-    known = median_calibration(where, (width, height), focal, 1.0)
+    known = api.median_calibration(where, (width, height), focal, 1.0)
     return replace(known, camera=known.camera.resized(*size), own=tuple(c.resized(*size) for c in known.own))
 
 
 def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArray[np.float64]:
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
-        return np.array([json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers])
-    return np.array(numbers) / (check_positive(where, "fps", json_number(where, metadata, "fps", 60.0) or 60.0))
+        return np.array([api.json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers])
+    return np.array(numbers) / (api.check_positive(where, "fps", api.json_number(where, metadata, "fps", 60.0) or 60.0))
 
 
 def _truth(
@@ -191,8 +169,8 @@ def _truth(
     poses = _rows(where, metadata, "poses", 7)
     if poses is None or len(poses) <= numbers[-1] or np.ptp(poses, 0).max() == 0:
         return None
-    T = np.stack([rigid_transform(f"{where}, pose {n}", poses[n, 4:], poses[n, [3, 0, 1, 2]]) for n in numbers])
-    return Trajectory(times_s, T @ FLIP_YZ)
+    T = np.stack([api.rigid_transform(f"{where}, pose {n}", poses[n, 4:], poses[n, [3, 0, 1, 2]]) for n in numbers])
+    return Trajectory(times_s, T @ api.FLIP_YZ)
 
 
 def _rows(where: Path, metadata: dict[str, Any], key: str, count: int) -> NDArray[np.float64] | None:
@@ -216,7 +194,7 @@ def _packed(place: Path) -> Path:
 def _recognises(path: str) -> bool:
     place = _packed(Path(path))
     if place.is_file():
-        with suppress(*DAMAGED), zipfile.ZipFile(place) as archive:
+        with suppress(*api.DAMAGED), zipfile.ZipFile(place) as archive:
             return place.suffix.lower() == ".r3d" or any("rgbd/" in name for name in archive.namelist())
         return place.suffix.lower() == ".r3d"
     return any((place / "rgbd").glob("*.depth")) or (
@@ -224,7 +202,7 @@ def _recognises(path: str) -> bool:
     )
 
 
-PLUGIN = SourceFormat(
+PLUGIN = api.SourceFormat(
     "Record3D", "a .r3d file, or metadata.json with rgb/ and depth/*.exr", _recognises, open_record3d,
     sensor="lidar-iphone",
 )  # fmt: skip

@@ -16,22 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    ASSUMED,
-    Accelerometer,
-    Gyroscope,
-    ImagePair,
-    InputConfig,
-    Matrix,
-    RecordedSource,
-    Size,
-    SourceFormat,
-    accelerometer_from_samples,
-    associate,
-    gyroscope_from_samples,
-    pair_times,
-    time_origins,
-)
+import sigmasplat.api as api
+from sigmasplat.api import InputConfig, RecordedSource, Size
 from sigmasplat.plugins.sources import bag_cameras, bag_messages
 from sigmasplat.plugins.sources.bag_cameras import ImageTopic
 from sigmasplat.plugins.sources.bag_messages import Bag, Entry, Message, Topic, is_bag, message_size
@@ -40,7 +26,9 @@ IMU = "sensor_msgs/msg/Imu"
 Values = NDArray[np.float64]
 
 
-def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> tuple[Gyroscope | None, Accelerometer | None]:
+def read_bag_imu(
+    bag: Bag, color: ImageTopic, frame_times_s: Values
+) -> tuple[api.Gyroscope | None, api.Accelerometer | None]:
     """Return gyroscope and accelerometer, each of the first topic that has its values in axes whose rotation to the
     colour camera is known. Cameras may publish them in two topics.
 
@@ -60,7 +48,7 @@ def read_bag_imu(bag: Bag, color: ImageTopic, frame_times_s: Values) -> tuple[Gy
         rates, forces = (values @ R_color_imu.T for values in _measured(bag, topic.name))
         entries = bag.index(topic.name)[topic.name]
         for times_s in (_times_s(entries, recorded) for recorded in (False, True)):
-            turns, pulls = gyroscope_from_samples(times_s, rates), accelerometer_from_samples(times_s, forces)
+            turns, pulls = api.gyroscope_from_samples(times_s, rates), api.accelerometer_from_samples(times_s, forces)
             if gyroscope is None and turns and turns.measured_any(frame_times_s):
                 gyroscope = turns
             if accelerometer is None and pulls and any(pulls.at(t) is not None for t in frame_times_s):
@@ -86,7 +74,7 @@ def _measured(bag: Bag, name: str) -> tuple[Values, Values]:
     return rates, forces
 
 
-def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
+def _axes(bag: Bag, color: ImageTopic, name: str) -> api.Matrix | None:
     if name.startswith("/device_"):
         T = bag_cameras.sdk_transform(bag, color, name.removesuffix("/imu/data"))
         return None if T is None else T[:3, :3]
@@ -100,7 +88,7 @@ def _axes(bag: Bag, color: ImageTopic, name: str) -> Matrix | None:
 
 
 @dataclass(frozen=True)
-class BagImagePair(ImagePair):
+class BagImagePair(api.ImagePair):
     """Two messages of a bag; the paths contain bag, topic and time."""
 
     bag: Bag
@@ -132,7 +120,7 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
     color_s, depth_s = (_times_s(part, recorded_time) for part in entries)
     colors, depths = _message_paths(bag, color.name, color_s), _message_paths(bag, depth.name, depth_s)
     depth_s = depth_s - settings.depth_delay_s
-    pairs, alone = pair_times(bag.path, {color.name: color_s, depth.name: depth_s}, settings)
+    pairs, alone = api.pair_times(bag.path, {color.name: color_s, depth.name: depth_s}, settings)
     known = 0.0 if recorded_time else 1.0  # how long messages travel says nothing about the images
     times = [(i, j, float(color_s[i]), known * float(depth_s[j] - color_s[i])) for i, j in pairs]
     images = [
@@ -140,11 +128,11 @@ def open_bag(place: str, settings: InputConfig) -> RecordedSource:
         for i, j, t, late in times
     ]
     skipped = [f"{colors[i]}: no depth within {settings.max_gap_s:g} s" for i in alone]
-    clock = ("recording time", ASSUMED, "header times") if recorded_time else ("header time", "read from the bag")
+    clock = ("recording time", api.ASSUMED, "header times") if recorded_time else ("header time", "read from the bag")
     gyroscope, accelerometer = read_bag_imu(bag, color, color_s)
     return RecordedSource(
         bag.path.resolve().stem, images, calibration, settings, None, skipped, None, gyroscope, accelerometer,
-        origins=time_origins(settings, f"by {clock[0]}", *clock[1:]),
+        origins=api.time_origins(settings, f"by {clock[0]}", *clock[1:]),
     )  # fmt: skip
 
 
@@ -157,7 +145,7 @@ def _uses_recorded_time(entries: tuple[Sequence[Entry], Sequence[Entry]], settin
 
     def pairs(recorded: bool) -> int:
         color_s, depth_s = (_times_s(part, recorded) for part in entries)
-        return len(associate(color_s, depth_s - settings.depth_delay_s, settings.max_gap_s))
+        return len(api.associate(color_s, depth_s - settings.depth_delay_s, settings.max_gap_s))
 
     return not has_times or pairs(True) > pairs(False)
 
@@ -170,6 +158,6 @@ def _message_paths(bag: Bag, topic: str, times_s: Values) -> list[Path]:
     return [bag.path / f"{topic.lstrip('/')} at {time_s:.3f} s" for time_s in times_s]
 
 
-PLUGIN = SourceFormat(
+PLUGIN = api.SourceFormat(
     "ROS bag", "a .bag, .mcap or .db3 file, or a folder with metadata.yaml", lambda path: is_bag(Path(path)), open_bag
 )

@@ -29,40 +29,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.api import (
-    COLOR_ENDINGS,
-    DEPTH_ENDINGS,
-    FRAMES_PER_SECOND,
-    MM_PER_METRE,
-    Calibration,
-    Camera,
-    Fields,
-    FrameFiles,
-    ImagePair,
-    InputConfig,
-    Matrix,
-    RecordedSource,
-    SourceError,
-    SourceFormat,
-    build_camera,
-    build_trajectory,
-    first_file,
-    first_size,
-    first_subfolder,
-    folder_source,
-    index_by_number,
-    list_images,
-    numbered_pairs,
-    published,
-    read_frames,
-    read_json_object,
-    read_matrix,
-    read_pose,
-    read_pose_files,
-    read_poses,
-    read_transforms_camera,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Calibration, Fields, InputConfig, RecordedSource, SourceError, SourceFormat, se3
 
 COLOR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)
 """Width and height of ScanNet's recordings. The published matrices are for these sizes, even if images are resized."""
@@ -76,46 +44,52 @@ def open_scannet(path: str, settings: InputConfig) -> RecordedSource:
         raise SourceError(
             f"{packed[0]} is not extracted; extract color, depth, pose and intrinsic from it with ScanNet's SensReader"
         )
-    images, skipped = numbered_pairs(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
-    known = _recorded(folder, *(first_size([files[kind][n] for n in images]) for kind in ("color", "depth")))
-    truth = read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
-    return folder_source(folder, settings, [*images.values()], known, MM_PER_METRE, truth, skipped)
+    images, skipped = api.numbered_pairs(folder, files["color"], files["depth"], "color/*.jpg", "depth/*.png")
+    known = _recorded(folder, *(api.first_size([files[kind][n] for n in images]) for kind in ("color", "depth")))
+    truth = api.read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
+    return api.folder_source(folder, settings, [*images.values()], known, api.MM_PER_METRE, truth, skipped)
 
 
-def _files(folder: Path) -> FrameFiles:
+def _files(folder: Path) -> api.FrameFiles:
     return {
-        "color": index_by_number(list_images(first_subfolder(folder, ("color", "rgb")), COLOR_ENDINGS)),
-        "depth": index_by_number(list_images(folder / "depth", DEPTH_ENDINGS)),
-        "pose": index_by_number(list_images(folder / "pose", (".txt",))),
+        "color": api.index_by_number(api.list_images(api.first_subfolder(folder, ("color", "rgb")), api.COLOR_ENDINGS)),
+        "depth": api.index_by_number(api.list_images(folder / "depth", api.DEPTH_ENDINGS)),
+        "pose": api.index_by_number(api.list_images(folder / "pose", (".txt",))),
     }
 
 
-PREPROCESSED = published("ScanNet's depth camera", Camera(*DEPTH_SIZE, 577.590698, 578.729797, 318.905426, 242.683609),
-                         MM_PER_METRE)  # fmt: skip
+PREPROCESSED = api.published("ScanNet's depth camera", api.Camera(*DEPTH_SIZE, 577.590698, 578.729797, 318.905426, 242.683609),
+                         api.MM_PER_METRE)  # fmt: skip
 
 
 def open_preprocessed(path: str, settings: InputConfig) -> RecordedSource:
     """Open a preprocessed scene's folder. Raises SourceError if images, camera or poses cannot be used."""
     folder = Path(path)
-    colors, depths = (index_by_number(list_images(folder / kind, DEPTH_ENDINGS)) for kind in ("rgb", "depth"))
-    images, skipped = numbered_pairs(folder, colors, depths, "rgb/*.png", "depth/*.TIFF")
-    T_world_camera = read_poses(folder / "gt_pose.txt").T_world_camera
+    colors, depths = (
+        api.index_by_number(api.list_images(folder / kind, api.DEPTH_ENDINGS)) for kind in ("rgb", "depth")
+    )
+    images, skipped = api.numbered_pairs(folder, colors, depths, "rgb/*.png", "depth/*.TIFF")
+    T_world_camera = api.read_poses(folder / "gt_pose.txt").T_world_camera
     last, count = max(images), len(T_world_camera)
     if last >= count:
         raise SourceError(
             f"{folder / 'gt_pose.txt'}: {count} poses, but the last image has number {last}; is the file truncated?"
         )
-    truth = build_trajectory((pair.timestamp_s, T_world_camera[n]) for n, pair in images.items())
-    K, size = folder / "intrinsic.txt", first_size([pair.color for pair in images.values()])
-    known = Calibration(_camera(K, read_matrix(K), size, DEPTH_SIZE), MM_PER_METRE) if K.is_file() else PREPROCESSED
-    return folder_source(folder, settings, [*images.values()], known, MM_PER_METRE, truth, skipped)
+    truth = api.build_trajectory((pair.timestamp_s, T_world_camera[n]) for n, pair in images.items())
+    K, size = folder / "intrinsic.txt", api.first_size([pair.color for pair in images.values()])
+    known = (
+        Calibration(_camera(K, api.read_matrix(K), size, DEPTH_SIZE), api.MM_PER_METRE) if K.is_file() else PREPROCESSED
+    )
+    return api.folder_source(folder, settings, [*images.values()], known, api.MM_PER_METRE, truth, skipped)
 
 
 def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) -> Calibration | None:
     """Build both cameras from the scene's matrices, None if they are missing. Raises SourceError if one is damaged."""
     names = [f"{part}_{kind}" for part in ("intrinsic", "extrinsic") for kind in ("color", "depth")]
-    files = {n: first_file(folder, (f"intrinsic/{n}.txt", f"{n.replace('_', 's_')}.txt", f"{n}.txt")) for n in names}
-    found = {name: (path, read_matrix(path)) for name, path in files.items() if path}
+    files = {
+        n: api.first_file(folder, (f"intrinsic/{n}.txt", f"{n.replace('_', 's_')}.txt", f"{n}.txt")) for n in names
+    }
+    found = {name: (path, api.read_matrix(path)) for name, path in files.items() if path}
     if "intrinsic_color" not in found:
         return None
     camera = _camera(*found["intrinsic_color"], size, COLOR_SIZE)
@@ -126,20 +100,20 @@ def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) 
     if not all(se3.is_rigid(T) for T in ends):
         raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
     T_color_depth = ends[0] @ se3.inverse(ends[1])
-    return Calibration(camera, MM_PER_METRE, depth_camera=depth_camera, T_color_depth=T_color_depth)
+    return Calibration(camera, api.MM_PER_METRE, depth_camera=depth_camera, T_color_depth=T_color_depth)
 
 
-def _camera(path: Path, K: Matrix, size: tuple[int, int], published: tuple[int, int]) -> Camera:
+def _camera(path: Path, K: api.Matrix, size: tuple[int, int], published: tuple[int, int]) -> api.Camera:
     """Build the camera for images of `size`; if the principal point does not fit it, resize the published camera."""
     own = size if abs(2 * K[0, 2] - size[0]) < 0.2 * size[0] else published
-    return build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
+    return api.build_camera(path, *own, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]).resized(*size)
 
 
 def _recognises(path: str) -> bool:
     folder = Path(path)
     if any(folder.glob("*.sens")):
         return True
-    images = first_subfolder(folder, ("color", "rgb", "depth"))
+    images = api.first_subfolder(folder, ("color", "rgb", "depth"))
     camera = (folder / "intrinsic").is_dir() or any(folder.glob("intrinsic*_*.txt"))
     return images is not None and (camera or (folder / "pose").is_dir())
 
@@ -151,7 +125,7 @@ IMAGES, DEPTHS, LISTS = "undistorted_images", "undistorted_depths", "train_test_
 def open_scannetpp(path: str, settings: InputConfig) -> RecordedSource:
     """Open a scene's folder or its `dslr`. Raises SourceError if its JSON file, images or camera cannot be used."""
     dslr = _dslr(Path(path))
-    fields = read_json_object(dslr / TRANSFORMS)
+    fields = api.read_json_object(dslr / TRANSFORMS)
     for part, made_by in ((IMAGES, "the toolbox's `python -m dslr.undistort`"), (DEPTHS, "a depth renderer")):
         if not (dslr / part).is_dir():
             there = ", ".join(sorted(entry.name for entry in dslr.iterdir() if entry.is_dir()))
@@ -169,17 +143,19 @@ def _source(
 ) -> RecordedSource:
     path, scene = dslr / TRANSFORMS, dslr.resolve().parent
     files = [(dslr / IMAGES / f["file_path"], (dslr / DEPTHS / f["file_path"]).with_suffix(".png")) for f in frames]
-    images = [ImagePair(i / FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
-    size = first_size([color for color, _ in files])
-    known = read_transforms_camera(path, fields, frames, size, MM_PER_METRE)
-    truth = build_trajectory((i.timestamp_s, read_pose(path, frame)) for i, frame in zip(images, frames, strict=True))
-    return folder_source(scene, settings, images, known, MM_PER_METRE, truth, test=test)
+    images = [api.ImagePair(i / api.FRAMES_PER_SECOND, *pair) for i, pair in enumerate(files)]
+    size = api.first_size([color for color, _ in files])
+    known = api.read_transforms_camera(path, fields, frames, size, api.MM_PER_METRE)
+    truth = api.build_trajectory(
+        (i.timestamp_s, api.read_pose(path, frame)) for i, frame in zip(images, frames, strict=True)
+    )
+    return api.folder_source(scene, settings, images, known, api.MM_PER_METRE, truth, test=test)
 
 
 def _chosen(dslr: Path, fields: Fields, split: str, key: str) -> list[Fields]:
     """Return the frames of a split, in the order of train_test_lists.json if it exists, else of their names."""
-    frames = {frame["file_path"]: frame for frame in read_frames(dslr / TRANSFORMS, fields, key)}
-    lists = read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
+    frames = {frame["file_path"]: frame for frame in api.read_frames(dslr / TRANSFORMS, fields, key)}
+    lists = api.read_json_object(dslr / LISTS) if (dslr / LISTS).is_file() else {}
     names = lists.get(split, sorted(frames))
     if not isinstance(names, list) or not names:
         raise SourceError(f"{dslr / LISTS}: {split!r} is {str(names)[:60]}, expected a list of file names")

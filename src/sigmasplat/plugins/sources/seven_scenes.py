@@ -13,31 +13,15 @@ from pathlib import Path
 
 import numpy as np
 
-from sigmasplat.api import (
-    MM_PER_METRE,
-    Camera,
-    InputConfig,
-    RecordedSource,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    first_size,
-    frame_files,
-    has_frame_files,
-    numbered_pairs,
-    published,
-    read_pose_files,
-    registers_depth,
-    resolve_calibration,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, RecordedSource, SourceError, se3
 
 # 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
 # colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
 # images (andyzeng/tsdf-fusion-python, data/; the fit is in shared/data/redkitchen/calibration.json).
-DEPTH_CAMERA = published("that of 7-Scenes", Camera(640, 480, 585.0, 585.0, 320.0, 240.0), MM_PER_METRE)
-BOTH_CAMERAS = published(
-    "that of 7-Scenes, both cameras", Camera(640, 480, 528.12, 528.12, 318.96, 232.91), MM_PER_METRE,
+DEPTH_CAMERA = api.published("that of 7-Scenes", Camera(640, 480, 585.0, 585.0, 320.0, 240.0), api.MM_PER_METRE)
+BOTH_CAMERAS = api.published(
+    "that of 7-Scenes, both cameras", Camera(640, 480, 528.12, 528.12, 318.96, 232.91), api.MM_PER_METRE,
     depth_camera=DEPTH_CAMERA.camera,
     T_color_depth=np.array([
         [0.999969, -0.007635, 0.001694, -0.02421],
@@ -48,25 +32,27 @@ BOTH_CAMERAS = published(
 )  # fmt: skip
 
 
-def open_seven_scenes(path: str, settings: InputConfig) -> RecordedSource:
+def open_seven_scenes(path: str, settings: api.InputConfig) -> RecordedSource:
     """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
-    folder = Path(path) if has_frame_files(Path(path)) else _only_sequence(Path(path))
-    files = frame_files(folder)
-    images, skipped = numbered_pairs(folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png")
+    folder = Path(path) if api.has_frame_files(Path(path)) else _only_sequence(Path(path))
+    files = api.frame_files(folder)
+    images, skipped = api.numbered_pairs(
+        folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png"
+    )
     known = BOTH_CAMERAS if settings.register_depth == "on" else DEPTH_CAMERA
-    size = first_size([pair.color for pair in images.values()])
-    calibration = resolve_calibration(folder, known, size, settings, MM_PER_METRE)
+    size = api.first_size([pair.color for pair in images.values()])
+    calibration = api.resolve_calibration(folder, known, size, settings, api.MM_PER_METRE)
     calibration = replace(calibration, T_color_depth=se3.orthonormalise(calibration.T_color_depth))
-    truth = read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
-    if truth and registers_depth(calibration, settings):
-        truth = Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
+    truth = api.read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
+    if truth and api.registers_depth(calibration, settings):
+        truth = api.Trajectory(truth.timestamps_s, truth.T_world_camera @ se3.inverse(calibration.T_color_depth))
     source = RecordedSource(folder.resolve().name, [*images.values()], calibration, settings, truth, skipped)
     source.registrable = source.registrable or calibration.camera == DEPTH_CAMERA.camera
     return source
 
 
 def _only_sequence(scene: Path) -> Path:
-    sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and has_frame_files(path)]
+    sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and api.has_frame_files(path)]
     packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
     if not sequences and packed:
         raise SourceError(f"{scene}: the sequences are not unpacked ({', '.join(packed[:3])}); unzip them first")
@@ -78,9 +64,9 @@ def _only_sequence(scene: Path) -> Path:
 
 def _recognises(path: str) -> bool:
     folder = Path(path)
-    if has_frame_files(folder):
+    if api.has_frame_files(folder):
         return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))
-    return any(has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
+    return any(api.has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
 
 
-PLUGIN = SourceFormat("7-Scenes", "frame-*.color.png", _recognises, open_seven_scenes, sensor="kinect-v1")
+PLUGIN = api.SourceFormat("7-Scenes", "frame-*.color.png", _recognises, open_seven_scenes, sensor="kinect-v1")

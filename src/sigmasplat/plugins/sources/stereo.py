@@ -12,28 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Calibration,
-    ImagePair,
-    InputConfig,
-    RecordedSource,
-    SourceError,
-    SourceFormat,
-    check_positive,
-    first_size,
-    json_number,
-    pair_times,
-    read_color,
-    read_groundtruth,
-    read_json_object,
-    resolve_calibration,
-)
+import sigmasplat.api as api
+from sigmasplat.api import SourceError
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher, scene_scale
 from sigmasplat.plugins.sources.tum import read_list
 
 
 @dataclass(frozen=True)
-class StereoPair(ImagePair):
+class StereoPair(api.ImagePair):
     """The left image (`color`) and the right image (`depth`) of one frame."""
 
     matcher: StereoMatcher
@@ -48,7 +34,7 @@ class StereoPair(ImagePair):
         return left, self.matcher.depth_and_std_m(left, right)[0]
 
     def _read(self, path: Path) -> NDArray[np.uint8]:
-        image, c = read_color(path), self.matcher.camera
+        image, c = api.read_color(path), self.matcher.camera
         if image.shape != (c.height, c.width, 3):
             raise SourceError(
                 f"{path} is {image.shape[1]}×{image.shape[0]} but the calibration is for {c.width}×{c.height}, 8 bits; "
@@ -57,31 +43,31 @@ class StereoPair(ImagePair):
         return image
 
 
-class StereoSource(RecordedSource):
+class StereoSource(api.RecordedSource):
     """A sequence of stereo pairs, with the depth of the left images."""
 
     computed_depth = True
 
 
-def open_stereo(place: str, settings: InputConfig) -> StereoSource:
+def open_stereo(place: str, settings: api.InputConfig) -> StereoSource:
     """Open a folder of stereo pairs. Raises SourceError if lists, images, calibration or poses cannot be used."""
     folder, name = Path(place), Path(place).resolve().name
     (left_s, lefts), (right_s, rights) = (read_list(folder / name) for name in ("rgb.txt", "right.txt"))
-    indices, alone = pair_times(folder, {"left": left_s, "right": right_s - settings.depth_delay_s}, settings)
+    indices, alone = api.pair_times(folder, {"left": left_s, "right": right_s - settings.depth_delay_s}, settings)
     skipped = [f"{lefts[i]}: no right image" for i in alone]
     path = Path(settings.calibration or folder / "calibration.json")
-    found = resolve_calibration(folder, None, first_size([lefts[i] for i, _ in indices]), settings, 1.0)
+    found = api.resolve_calibration(folder, None, api.first_size([lefts[i] for i, _ in indices]), settings, 1.0)
     if not path.is_file():
         raise SourceError(f"{folder}: the baseline of the stereo pair is unknown; write {path} with baseline_m, metres")
     if found.distortion and settings.undistort:
         raise SourceError(f'{path}: field "distortion" is given, but a stereo pair must be rectified; rectify it first')
-    baseline_m = check_positive(path, "baseline_m", json_number(path, read_json_object(path), "baseline_m"))
-    truth = read_groundtruth(folder)
+    baseline_m = api.check_positive(path, "baseline_m", api.json_number(path, api.read_json_object(path), "baseline_m"))
+    truth = api.read_groundtruth(folder)
     if settings.depth_scale:
         raise SourceError(f"{name}: input.depth_scale does not apply to a stereo pair; correct its baseline")
     matcher = StereoMatcher(found.camera, baseline_m)
     images = [StereoPair(float(left_s[i]), lefts[i], rights[j], matcher) for i, j in indices]
-    source = StereoSource(name, images, Calibration(found.camera, 1.0), settings, truth, skipped)
+    source = StereoSource(name, images, api.Calibration(found.camera, 1.0), settings, truth, skipped)
     source.depth_noise_per_m, source.scene_scale = matcher.noise_per_m, scene_scale(source.depth_of, len(source))
     return source
 
@@ -92,4 +78,4 @@ def _recognises(path: str) -> bool:
     return not with_depth and (folder / "rgb.txt").is_file() and (folder / "right.txt").is_file()
 
 
-PLUGIN = SourceFormat("stereo pair", "rgb.txt and right.txt", _recognises, open_stereo, priority=2)
+PLUGIN = api.SourceFormat("stereo pair", "rgb.txt and right.txt", _recognises, open_stereo, priority=2)

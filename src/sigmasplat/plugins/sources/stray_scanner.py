@@ -17,28 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    GRAVITY_M_S2,
-    MM_PER_METRE,
-    Calibration,
-    ImagePair,
-    InputConfig,
-    RecordedSource,
-    Size,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    Video,
-    accelerometer_from_samples,
-    build_camera,
-    csv_rows,
-    folder_source,
-    gyroscope_from_samples,
-    median_calibration,
-    parse_numbers,
-    read_lines,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Calibration, SourceError, Trajectory, se3
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 ANGULAR, LINEAR = ("alpha_x", "alpha_y", "alpha_z"), ("a_x", "a_y", "a_z")
@@ -49,7 +29,7 @@ INTRINSICS = ("fx", "fy", "cx", "cy")
 Rows = dict[int, dict[str, float]]
 
 
-def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
+def open_stray_scanner(path: str, settings: api.InputConfig) -> api.RecordedSource:
     """Open a folder. Raises SourceError if video, depth, camera or poses cannot be used."""
     folder = Path(path)
     video_path = folder / "rgb.mp4"
@@ -58,7 +38,7 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
         raise SourceError(f"no video in {folder} (looked for rgb.mp4); copy the whole folder from the phone")
     if not depths:
         raise SourceError(f"no depth images in {folder} (looked for depth/000000.png, …); does the phone have a LiDAR?")
-    rows, video = _odometry(folder / "odometry.csv"), Video(video_path)
+    rows, video = _odometry(folder / "odometry.csv"), api.Video(video_path)
     numbers = [n for n in sorted(depths) if n in rows and n < video.count]
     if not numbers:
         raise SourceError(
@@ -66,26 +46,26 @@ def open_stray_scanner(path: str, settings: InputConfig) -> RecordedSource:
             f"({len(rows)} lines); copy the whole folder again"
         )
     images = [
-        ImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video=(video, n),
+        api.ImagePair(rows[n]["timestamp"], folder / f"rgb.mp4 frame {n}", depths[n], video=(video, n),
                   confidence=folder / "confidence" / depths[n].name)
         for n in numbers
     ]  # fmt: skip
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted({*depths} - {*numbers})]
     used, (moved_s, rates, forces) = [rows[n] for n in numbers], _imu(folder / "imu.csv")
     times_s, known = np.array([row["timestamp"] for row in used]), _calibration(folder, used, video.size)
-    truth, gyroscope = _truth(times_s, used), gyroscope_from_samples(moved_s, rates)
+    truth, gyroscope = _truth(times_s, used), api.gyroscope_from_samples(moved_s, rates)
     if gyroscope and not gyroscope.measured_any(times_s):
         gyroscope = None
-    return folder_source(
-        folder, settings, images, known, MM_PER_METRE, truth, skipped, one_camera=True, estimated="ARKit",
-        gyroscope=gyroscope, accelerometer=accelerometer_from_samples(moved_s, forces),
+    return api.folder_source(
+        folder, settings, images, known, api.MM_PER_METRE, truth, skipped, one_camera=True, estimated="ARKit",
+        gyroscope=gyroscope, accelerometer=api.accelerometer_from_samples(moved_s, forces),
     )  # fmt: skip
 
 
 def _odometry(path: Path) -> Rows:
     if not path.is_file():
         raise SourceError(f"{path} is missing: it holds the times of the frames; copy the whole folder again")
-    lines = csv_rows(path)
+    lines = api.csv_rows(path)
     _, names = next(lines, (0, []))
     if not set(POSE) <= set(names):
         raise SourceError(
@@ -105,16 +85,16 @@ def _odometry(path: Path) -> Rows:
     return rows
 
 
-def _calibration(folder: Path, rows: list[dict[str, float]], size: Size) -> Calibration | None:
+def _calibration(folder: Path, rows: list[dict[str, float]], size: api.Size) -> Calibration | None:
     """Read the camera: the median of all frames if they have intrinsics, because autofocus changes them slightly."""
     path, focals = folder / "camera_matrix.csv", [[row[name] for name in INTRINSICS if name in row] for row in rows]
     if len(focals[0]) == len(INTRINSICS):
-        return median_calibration(folder / "odometry.csv", size, np.array(focals), MM_PER_METRE)
-    return Calibration(build_camera(path, *size, _matrix(path)), MM_PER_METRE) if path.is_file() else None
+        return api.median_calibration(folder / "odometry.csv", size, np.array(focals), api.MM_PER_METRE)
+    return Calibration(api.build_camera(path, *size, _matrix(path)), api.MM_PER_METRE) if path.is_file() else None
 
 
 def _matrix(path: Path) -> list[float]:
-    rows = [parse_numbers(path, line, words) for line, words in read_lines(path)]
+    rows = [api.parse_numbers(path, line, words) for line, words in api.read_lines(path)]
     if [len(row) for row in rows] != [3, 3, 3]:
         raise SourceError(f"{path}: expected a 3×3 matrix, found rows of {[len(row) for row in rows]}; copy it again")
     return [rows[0][0], rows[1][1], rows[0][2], rows[1][2]]
@@ -130,14 +110,14 @@ def _truth(times_s: NDArray[np.float64], rows: list[dict[str, float]]) -> Trajec
 def _imu(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Read times [M], angular velocities and specific forces [M, 3] along the camera's axes; Apple's sign is that of
     gravity. What is missing or cannot be read is nan: the app may be stopped while it writes a line."""
-    lines = csv_rows(path, errors="replace") if path.is_file() else iter(())
+    lines = api.csv_rows(path, errors="replace") if path.is_file() else iter(())
     _, header = next(lines, (0, []))
     samples = []
     for _, line in lines:
         words = dict(zip(header, line, strict=False))
         samples.append([_number(words.get(name)) for name in ("timestamp", *ANGULAR, *LINEAR)])
     values = np.array(samples).reshape(-1, 7)
-    rates, forces = values[:, 1:4], -GRAVITY_M_S2 * values[:, 4:]
+    rates, forces = values[:, 1:4], -api.GRAVITY_M_S2 * values[:, 4:]
     return values[:, 0], rates @ R_CAMERA_PHONE.T, forces @ R_CAMERA_PHONE.T
 
 
@@ -152,6 +132,6 @@ def _recognises(path: str) -> bool:
     return (folder / "odometry.csv").is_file() or ((folder / "rgb.mp4").is_file() and (folder / "depth").is_dir())
 
 
-PLUGIN = SourceFormat(
+PLUGIN = api.SourceFormat(
     "Stray Scanner", "rgb.mp4, depth/ and odometry.csv", _recognises, open_stray_scanner, sensor="lidar-iphone"
 )

@@ -7,18 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Camera,
-    Frame,
-    Matrix,
-    Mesh,
-    Source,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    color_from_bytes,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Frame, Matrix, Mesh, Source, SourceError, SourceFormat, Trajectory, se3
 from sigmasplat.plugins.sources.room import capture
 from sigmasplat.plugins.sources.room.capture import Image, camera_path
 from sigmasplat.plugins.sources.room.corridor import corridor_path, sections
@@ -122,7 +112,7 @@ class SyntheticRoom(Source):
         if self._matcher:
             depth_m, _ = self._matcher.depth_and_std_m(bytes_, self.right_image(i))
         depth_m = capture.misread_depth(depth_m, *self._misread)
-        return Frame(i, self.timestamp_s(i), color_from_bytes(bytes_), depth_m, self.camera)
+        return Frame(i, self.timestamp_s(i), api.color_from_bytes(bytes_), depth_m, self.camera)
 
     def right_image(self, i: int) -> NDArray[np.uint8]:
         """Render the right image of the stereo pair of frame i, RGB [H, W, 3], with the exposure of the left one."""
@@ -221,7 +211,7 @@ class _ViewsAway(Source):
     def frame(self, i: int) -> Frame:
         _, color, depth_m = self._images[self._checked_index(i)]
         bytes_ = np.rint(np.clip(color, 0.0, 1.0) * 255.0).astype(np.uint8)
-        return Frame(i, i / FRAMES_PER_SECOND, color_from_bytes(bytes_), depth_m, self.camera)
+        return Frame(i, i / FRAMES_PER_SECOND, api.color_from_bytes(bytes_), depth_m, self.camera)
 
     def exact_depth_of(self, i: int) -> Image:
         return self._images[self._checked_index(i)][2]

@@ -31,39 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.api import (
-    ASSUMED,
-    FRAMES_PER_SECOND,
-    MM_PER_METRE,
-    TUM_UNITS_PER_METRE,
-    UINT16_MAX,
-    Camera,
-    Frame,
-    Gyroscope,
-    ImagePair,
-    InputConfig,
-    Origin,
-    RecordedSource,
-    RunError,
-    SourceError,
-    SourceFormat,
-    Trajectory,
-    exists,
-    first_file,
-    folder_source,
-    freiburg_calibration,
-    guarded,
-    nearest_gaps_s,
-    pair_times,
-    parse_numbers,
-    published,
-    read_groundtruth,
-    read_lines,
-    read_listed,
-    read_poses,
-    se3,
-    time_origins,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Gyroscope, ImagePair, InputConfig, Origin, RunError, SourceError, SourceFormat, se3
 
 COLOR_LISTS, DEPTH_LISTS = ("rgb.txt", "color.txt"), ("aligned_depth.txt", "depth.txt")
 """The second name of colour, and the first of depth, are OpenLORIS's, whose depth is in millimetres."""
@@ -72,40 +41,40 @@ MOTION_CAPTURE = 0.004, float(np.deg2rad(0.3))
 much, whatever the time between two poses."""
 
 
-def open_tum(path: str, settings: InputConfig, bonn: bool = False) -> RecordedSource:
+def open_tum(path: str, settings: InputConfig, bonn: bool = False) -> api.RecordedSource:
     """Open a folder; bonn: whether it has the camera and the markers' path of the Bonn data set. Raises SourceError if
     its lists, images, calibration, ground-truth poses or gyroscope cannot be used."""
     folder = Path(path)
-    colors_of = first_file(folder, COLOR_LISTS) or folder / COLOR_LISTS[0]
+    colors_of = api.first_file(folder, COLOR_LISTS) or folder / COLOR_LISTS[0]
     color_s, colors = read_list(colors_of)
     depth_s, depths = _depth_list(folder)
     depth_s -= settings.depth_delay_s
-    pairs, alone = pair_times(folder, {colors_of.name: color_s, "depth.txt": depth_s}, settings)
+    pairs, alone = api.pair_times(folder, {colors_of.name: color_s, "depth.txt": depth_s}, settings)
     images = [
         ImagePair(float(color_s[i]), colors[i], depths[j], depth_late_s=float(depth_s[j] - color_s[i]))
         for i, j in pairs
     ]
-    gaps_s = np.abs(nearest_gaps_s(color_s, depth_s))
+    gaps_s = np.abs(api.nearest_gaps_s(color_s, depth_s))
     skipped = [
         f"{colors[i]}: no depth within {settings.max_gap_s:g} s, nearest {gaps_s[i]:.3f} s away"
         + " (used by another image)" * bool(gaps_s[i] < settings.max_gap_s)
         for i in alone
     ]
-    truth = read_groundtruth(folder)
+    truth = api.read_groundtruth(folder)
     if bonn and truth:
-        truth = Trajectory(truth.timestamps_s, T_ROS @ truth.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
-    known = BONN if bonn else freiburg_calibration(folder)
+        truth = api.Trajectory(truth.timestamps_s, T_ROS @ truth.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
+    known = BONN if bonn else api.freiburg_calibration(folder)
     truth = replace(truth, error_rms=MOTION_CAPTURE) if truth and known else truth
-    gyroscope = read_gyroscope(folder / "gyroscope.txt") if exists(folder / "gyroscope.txt") else None
-    units = TUM_UNITS_PER_METRE if colors_of.name == COLOR_LISTS[0] else MM_PER_METRE
-    return folder_source(
+    gyroscope = read_gyroscope(folder / "gyroscope.txt") if api.exists(folder / "gyroscope.txt") else None
+    units = api.TUM_UNITS_PER_METRE if colors_of.name == COLOR_LISTS[0] else api.MM_PER_METRE
+    return api.folder_source(
         folder, settings, images, known, units, truth, skipped, gyroscope=gyroscope,
-        origins=time_origins(settings, "by time", "read from their lists"),
+        origins=api.time_origins(settings, "by time", "read from their lists"),
     )  # fmt: skip
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
-    path, looked_for, remedy = first_file(folder, DEPTH_LISTS) or folder / "depth.txt", "depth.txt", ""
+    path, looked_for, remedy = api.first_file(folder, DEPTH_LISTS) or folder / "depth.txt", "depth.txt", ""
     if path.is_file():
         times_s, paths = read_list(path)
         if any(p.is_file() for p in paths):
@@ -118,7 +87,7 @@ def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
 
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
-    lines = list(read_listed(path, "timestamp path"))
+    lines = list(api.read_listed(path, "timestamp path"))
     return np.array([t for (t,), _ in lines]), [file for _, (file,) in lines]
 
 
@@ -126,10 +95,10 @@ def read_gyroscope(path: Path) -> Gyroscope:
     """Read "t wx wy wz" lines, seconds and rad/s in camera axes. Raises SourceError naming the file, and the line if
     it has other values or no later time than the line before."""
     rows: list[list[float]] = []
-    for line, words in read_lines(path):
+    for line, words in api.read_lines(path):
         if len(words) != 4:
             raise SourceError(f"{path}:{line}: expected 't wx wy wz', found {len(words)} values")
-        rows.append(parse_numbers(path, line, words))
+        rows.append(api.parse_numbers(path, line, words))
         if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
             raise SourceError(f"{path}:{line}: time {words[0]} is not after that of the line before; sort the lines")
     if len(rows) < 2:
@@ -158,15 +127,15 @@ class TumWriter:
         with self._writing():
             for part in ("rgb", "depth"):
                 (folder / part).mkdir(parents=True, exist_ok=True)
-            calibration = asdict(camera) | {"depth_scale": TUM_UNITS_PER_METRE}
+            calibration = asdict(camera) | {"depth_scale": api.TUM_UNITS_PER_METRE}
             (folder / "calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: api.Frame) -> None:
         """Write one more frame; timestamps must increase. Raises RunError if the folder cannot be written."""
         stem = f"{frame.timestamp_s:.6f}"
-        units = np.rint(frame.depth_m * TUM_UNITS_PER_METRE)
+        units = np.rint(frame.depth_m * api.TUM_UNITS_PER_METRE)
         images = {
-            "depth": np.where(units < UINT16_MAX, units, 0).astype(np.uint16),
+            "depth": np.where(units < api.UINT16_MAX, units, 0).astype(np.uint16),
             "rgb": np.rint(frame.color * 255.0).astype(np.uint8),
         }
         with self._writing():
@@ -177,12 +146,12 @@ class TumWriter:
                     file.write(f"{'' if file.tell() else HEAD}{stem} {part}/{stem}.png\n")
 
     def _writing(self) -> AbstractContextManager[None]:
-        return guarded(self.folder, "choose a writable place", RunError, "the sequence cannot be written")
+        return api.guarded(self.folder, "choose a writable place", RunError, "the sequence cannot be written")
 
 
-BONN = published(
-    "that of the Bonn data set", Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098), TUM_UNITS_PER_METRE,
-    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+BONN = api.published(
+    "that of the Bonn data set", Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098),
+    api.TUM_UNITS_PER_METRE, (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
 )  # fmt: skip
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 T_MARKERS_CAMERA = se3.orthonormalise(
@@ -195,15 +164,15 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 )  # fmt: skip
 
 
-ICL_NUIM = published("that of ICL-NUIM", Camera(640, 480, 481.2, 480.0, 319.5, 239.5), TUM_UNITS_PER_METRE)
+ICL_NUIM = api.published("that of ICL-NUIM", Camera(640, 480, 481.2, 480.0, 319.5, 239.5), api.TUM_UNITS_PER_METRE)
 LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
-def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
+def open_icl_nuim(path: str, settings: InputConfig) -> api.RecordedSource:
     """Open a folder. Raises SourceError if its list, images or ground-truth poses cannot be used."""
     folder = Path(path)
-    listed = first_file(folder, LIST_NAMES)
+    listed = api.first_file(folder, LIST_NAMES)
     if listed is None:
         raise SourceError(
             f"{folder}: text depth is not supported; take the set's TUM-compatible PNGs (…_frei_png.tar.gz)"
@@ -211,16 +180,18 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
     images, numbered = _listed_pairs(listed)
     mirrored = next(iter(sorted(folder.glob("*.gt.freiburg"))), None)
     rendered = mirrored is not None or "frei_png" in folder.resolve().name
-    known = ICL_NUIM if rendered else freiburg_calibration(folder)
-    truth = read_poses(mirrored) if mirrored else read_groundtruth(folder)
+    known = ICL_NUIM if rendered else api.freiburg_calibration(folder)
+    truth = api.read_poses(mirrored) if mirrored else api.read_groundtruth(folder)
     if mirrored and truth:
-        truth = Trajectory(truth.timestamps_s / FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
+        truth = api.Trajectory(truth.timestamps_s / api.FRAMES_PER_SECOND, MIRROR @ truth.T_world_camera @ MIRROR)
     if truth and known:
         truth = replace(truth, error_rms=(0.0, 0.0) if rendered else MOTION_CAPTURE)
     origins = {"pairs": Origin("by line", f"read from {listed.name}")}
     if numbered:
-        origins["times"] = Origin(f"1/{FRAMES_PER_SECOND:g} s apart", ASSUMED, f"times in seconds in {listed.name}")
-    source = folder_source(folder, settings, images, known, TUM_UNITS_PER_METRE, truth, origins=origins)
+        origins["times"] = Origin(
+            f"1/{api.FRAMES_PER_SECOND:g} s apart", api.ASSUMED, f"times in seconds in {listed.name}"
+        )
+    source = api.folder_source(folder, settings, images, known, api.TUM_UNITS_PER_METRE, truth, origins=origins)
     source.sensor = source.sensor or ("rendered" if rendered else None)
     return source
 
@@ -228,19 +199,19 @@ def open_icl_nuim(path: str, settings: InputConfig) -> RecordedSource:
 def _listed_pairs(path: Path) -> tuple[list[ImagePair], bool]:
     """Read the list, and whether it has frame numbers, not times; the path with "depth" in it is the depth image."""
     images = []
-    for times, files in read_listed(path, "time depth/path time rgb/path"):
+    for times, files in api.read_listed(path, "time depth/path time rgb/path"):
         is_depth = ["depth" in "/".join(file.parts[-2:]) for file in files]
         if sum(is_depth) != 1:
             raise SourceError(f"{path}: expected 'depth' in one path of each line, found {files[0]} and {files[1]}")
         color, depth = is_depth.index(False), is_depth.index(True)
         images.append(ImagePair(times[color], files[color], files[depth]))
     if numbered := all(image.timestamp_s.is_integer() for image in images):
-        images = [ImagePair(i.timestamp_s / FRAMES_PER_SECOND, i.color, i.depth) for i in images]
+        images = [ImagePair(i.timestamp_s / api.FRAMES_PER_SECOND, i.color, i.depth) for i in images]
     return sorted(images, key=lambda image: image.timestamp_s), numbered
 
 
 def _has_lists(path: str) -> bool:
-    return first_file(Path(path), (*COLOR_LISTS, *DEPTH_LISTS)) is not None
+    return api.first_file(Path(path), (*COLOR_LISTS, *DEPTH_LISTS)) is not None
 
 
 def _is_bonn(path: str) -> bool:
@@ -248,7 +219,7 @@ def _is_bonn(path: str) -> bool:
 
 
 def _is_icl_nuim(path: str) -> bool:
-    return first_file(Path(path), LIST_NAMES) is not None or any(Path(path).glob("scene_*_0000.depth"))
+    return api.first_file(Path(path), LIST_NAMES) is not None or any(Path(path).glob("scene_*_0000.depth"))
 
 
 PLUGIN = (

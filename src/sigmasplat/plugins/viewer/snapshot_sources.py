@@ -8,26 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from torch import Tensor
 
-from sigmasplat.api import (
-    LOST,
-    TRUTH,
-    Callback,
-    Camera,
-    Config,
-    FieldRenderer,
-    GaussianField,
-    MapUncertainty,
-    Matrix,
-    RunFolder,
-    RunFrames,
-    SigmaSplatError,
-    SubmapStore,
-    Trajectory,
-    outside_world,
-    read_poses,
-    states_at_end,
-    submaps_outside,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Matrix
 from sigmasplat.plugins.outputs.drawing.colormap import Rgb
 from sigmasplat.plugins.outputs.first_look import VIEWS, best_view, sure
 from sigmasplat.plugins.outputs.floorplan.ground import Up, floor_frame, sample_surfaces, up_of
@@ -50,14 +32,14 @@ EVERY_S = 2.0
 ShowSnapshot = Callable[[Snapshot], None]
 
 
-def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
+def finished_snapshot(run: api.RunFolder, budget: int = BUDGET) -> Snapshot:
     """Read the snapshot of a finished run.
 
     Raises RunError if the run stopped before it had a map, or if its uncertainty belongs to another map.
     """
     final, frames, tensors = run.read_map(), run.read_frames(), run.read_checkpoint()[0]
     splats = field_without_moments(final.params, {name: rows.params for name, rows in final.attributes.items()})
-    config, true_file = run.config(), run.path / TRUTH
+    config, true_file = run.config(), run.path / api.TRUTH
     cache = SubmapCache(run.submaps, budget)
     cache.load(np.asarray(tensors["T_world_submap"], np.float64))  # for the images of keyframes
     camera = cache.camera or DEFAULT_CAMERA
@@ -67,7 +49,7 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
         _final_path(frames, tensors),
         piece,
         (),
-        read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
+        api.read_poses(true_file).T_world_camera[:, :3, 3] if true_file.is_file() else None,
         camera,
         cache.image,
         config.render,
@@ -77,19 +59,19 @@ def finished_snapshot(run: RunFolder, budget: int = BUDGET) -> Snapshot:
     )
 
 
-def final_piece(splats: GaussianField, known: MapUncertainty | None, T_world_camera: Matrix) -> Piece:
+def final_piece(splats: api.GaussianField, known: api.MapUncertainty | None, T_world_camera: Matrix) -> Piece:
     """Return a final map as a piece; T_world_camera [F, 4, 4]: the poses that it was made from."""
     return Piece(None, splats, uncertainty=known, sure=sure(splats, known, T_world_camera[:, :3, 3]))
 
 
-def opening(piece: Piece, path: Trajectory, camera: Camera, config: Config, up: Up) -> Opening | None:
+def opening(piece: Piece, path: api.Trajectory, camera: Camera, config: api.Config, up: Up) -> Opening | None:
     """Return the view of the run that opens its map; None if it sees nothing from its path."""
     field = piece.field if piece.sure is None else piece.field.part(piece.sure)
-    renderer = FieldRenderer(config.render, config.backend)
+    renderer = api.FieldRenderer(config.render, config.backend)
     try:
         samples = list(sample_surfaces(field, path, camera, renderer, VIEWS))
         T_floor_world = floor_frame(samples, up)
-    except SigmaSplatError:
+    except api.SigmaSplatError:
         return None
     T, points = samples[best := best_view(samples)].T_world_camera, samples[best].points
     ahead_m = float(np.median((points - T[:3, 3]) @ T[:3, 2]))
@@ -99,7 +81,7 @@ def opening(piece: Piece, path: Trajectory, camera: Camera, config: Config, up: 
 class SubmapCache:
     """The finished submaps that have been read so far, within a budget of splats, and the images of their keyframes."""
 
-    def __init__(self, store: SubmapStore, budget: int = BUDGET) -> None:
+    def __init__(self, store: api.SubmapStore, budget: int = BUDGET) -> None:
         self.store, self.budget = store, budget
         self.pieces: dict[int, Piece] = {}
         self.camera: Camera | None = None
@@ -123,7 +105,7 @@ class SubmapCache:
         return self.store.picture(*self._keyframes[row]).color
 
 
-def _final_path(frames: RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
+def _final_path(frames: api.RunFrames, tensors: Mapping[str, Tensor]) -> CameraPath:
     """Return the path of a finished run: valid poses from trajectory.txt, the others from the checkpoint."""
     poses = np.tile(np.eye(4), (len(frames), 1, 1))
     kept = np.asarray(tensors["T_world_camera"], np.float64)[: len(frames)]
@@ -141,7 +123,7 @@ ACTIVE_SHARE = 1 / 3
 """Share of the budget for the active submap; the finished ones use the rest."""
 
 
-class LiveView(Callback):
+class LiveView(api.Callback):
     """Shows snapshots of a system.
 
     It copies the map between two frames, in the thread of the run, so that no data change while they are read.
@@ -176,11 +158,11 @@ class LiveView(Callback):
         """Copy the current state of the system; include the final map if it is finished."""
         slam = self.slam
         lost, submaps = slam.steps.lost, slam.steps.submap
-        known = [LOST if is_lost else state for is_lost, state in zip(lost, slam.steps.states, strict=True)]
-        states = states_at_end(known, slam.valid())
-        outside = submaps_outside(states, submaps)
+        known = [api.LOST if is_lost else state for is_lost, state in zip(lost, slam.steps.states, strict=True)]
+        states = api.states_at_end(known, slam.valid())
+        outside = api.submaps_outside(states, submaps)
         poses, keyframes = slam.atlas.T_world_camera(), tuple(slam.keyframe_indices)
-        path = CameraPath(poses, lost, submaps, keyframes, outside_world(states))
+        path = CameraPath(poses, lost, submaps, keyframes, api.outside_world(states))
         anchors = slam.atlas.anchors
         self._finished.load(anchors)
         placed = [replace(piece, T_world_piece=anchors[i].copy()) for i, piece in self._finished.pieces.items()]

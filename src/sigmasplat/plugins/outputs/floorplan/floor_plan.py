@@ -8,20 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    Camera,
-    ConfigError,
-    FieldRenderer,
-    GaussianField,
-    Matrix,
-    Progress,
-    RunFolder,
-    SigmaSplatError,
-    Trajectory,
-    no_progress,
-    predict,
-    render,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, Matrix, Progress, Trajectory
 from sigmasplat.plugins.evaluation.view_scores import Renderer
 from sigmasplat.plugins.outputs.floorplan.ground import (
     Edge,
@@ -99,9 +87,9 @@ class FloorPlan:
 
 
 def floor_plan(
-    field: GaussianField, trajectory: Trajectory, camera: Camera, *, cell_m: float = CELL_M,
-    renderer: Renderer = render, predictor: SurfacePredictor | None = None, up: Up | None = None,
-    progress: Progress = no_progress,
+    field: api.GaussianField, trajectory: Trajectory, camera: Camera, *, cell_m: float = CELL_M,
+    renderer: Renderer = api.render, predictor: SurfacePredictor | None = None, up: Up | None = None,
+    progress: Progress = api.no_progress,
 ) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
 
@@ -110,7 +98,7 @@ def floor_plan(
     if no surface is visible, or the plan has more than `MOST_CELLS`.
     """
     if not 0.001 <= cell_m <= 1.0:
-        raise ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
+        raise api.ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
     samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
     T_floor_world = floor_frame(samples, up)
 
@@ -128,8 +116,8 @@ def floor_plan(
 
 
 def run_floor_plan(
-    run: RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, up: Edge = "auto",
-    progress: Progress = no_progress,
+    run: api.RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, up: Edge = "auto",
+    progress: Progress = api.no_progress,
 ) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a run's map.
 
@@ -142,9 +130,9 @@ def run_floor_plan(
     config, field = run.config(), run.read_map()
     known, predictor = run.uncertainty_of(field), None
     if known is not None:
-        predictor = partial(predict, field, known, options=config.render, backend=config.backend)
+        predictor = partial(api.predict, field, known, options=config.render, backend=config.backend)
     return floor_plan(
-        field, path, camera, cell_m=cell_m, renderer=FieldRenderer(config.render, config.backend),
+        field, path, camera, cell_m=cell_m, renderer=api.FieldRenderer(config.render, config.backend),
         predictor=predictor, up=up_of(path.T_world_camera, run.facts(), up), progress=progress,
     )  # fmt: skip
 
@@ -169,7 +157,7 @@ class _Cells:
         count = np.ceil(high / cell_m) + MARGIN_CELLS - first
         if not np.prod(count) <= MOST_CELLS:  # also if it is NaN
             size = " × ".join(f"{n * cell_m:.0f}" for n in count)
-            raise SigmaSplatError(
+            raise api.SigmaSplatError(
                 f"a floor plan of {size} m has too many cells of {cell_m} m (at most {MOST_CELLS:,}); use larger cells"
             )
         return _Cells(first * cell_m, (int(count[1]), int(count[0])), cell_m)

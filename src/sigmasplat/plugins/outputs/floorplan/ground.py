@@ -9,19 +9,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import erfc
 
-from sigmasplat.api import (
-    Camera,
-    GaussianField,
-    Matrix,
-    Predicted,
-    Progress,
-    SigmaSplatError,
-    Trajectory,
-    evenly_spaced,
-    no_progress,
-    noted_up,
-    se3,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, GaussianField, Matrix, se3
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, Renderer, as_array
 
 WIDTH_PX = 160
@@ -34,7 +23,7 @@ MAX_DEPTH_STEP = 0.05
 
 Floats = NDArray[np.float32]
 
-SurfacePredictor = Callable[[Camera, Matrix], Predicted]
+SurfacePredictor = Callable[[Camera, Matrix], api.Predicted]
 """Predicts the errors of a field from T_camera_world."""
 
 
@@ -57,12 +46,12 @@ class SurfaceSample:
 
 
 def sample_surfaces(
-    field: GaussianField, trajectory: Trajectory, camera: Camera, renderer: Renderer, max_poses: int = MAX_POSES,
-    progress: Progress = no_progress, predictor: SurfacePredictor | None = None,
+    field: GaussianField, trajectory: api.Trajectory, camera: Camera, renderer: Renderer, max_poses: int = MAX_POSES,
+    progress: api.Progress = api.no_progress, predictor: SurfacePredictor | None = None,
 ) -> Iterator[SurfaceSample]:  # fmt: skip
     """Sample from at most `max_poses` poses, evenly spaced over the path, including the first and the last."""
     small = camera.resized(WIDTH_PX, max(1, round(camera.height * WIDTH_PX / camera.width)))
-    rows = evenly_spaced(len(trajectory), max_poses)
+    rows = api.evenly_spaced(len(trajectory), max_poses)
     for done, row in enumerate(rows, 1):
         yield sample_surface(field, small, trajectory.T_world_camera[row], renderer, predictor)
         progress(done, len(rows))
@@ -135,7 +124,7 @@ class Up(NamedTuple):
 def up_of(T_world_camera: Matrix, facts: Mapping[str, Any] | None = None, edge: Edge = "auto") -> Up:
     """Return about where up is for a path [N, 4, 4]: at an edge of the images, as the user says; else as an
     accelerometer measured it (facts: run.json of the run); else at the top, as cameras are mostly held."""
-    measured = noted_up(facts or {})
+    measured = api.noted_up(facts or {})
     if edge == "auto" and measured is not None:
         return Up(measured, MEASURED_COS, "measured by the accelerometer")
     axis, sign = EDGES["top" if edge == "auto" else edge]
@@ -176,7 +165,7 @@ def _subsampled(samples: Sequence[SurfaceSample]) -> tuple[Matrix, Matrix, Matri
     """Return points, normals [P, 3] and areas [P] of every k-th sample."""
     total = sum(len(sample.points) for sample in samples)
     if not total:
-        raise SigmaSplatError("no surface of the map is visible from its path; do map and path belong together?")
+        raise api.SigmaSplatError("no surface of the map is visible from its path; do map and path belong together?")
     step = max(1, total // MAX_POINTS)
     stacked = [np.concatenate([getattr(s, name) for s in samples])[::step] for name in ("points", "normals", "area_m2")]
     points, normals, area = (values.astype(np.float64) for values in stacked)

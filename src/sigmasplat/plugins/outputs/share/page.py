@@ -20,23 +20,8 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from sigmasplat.api import (
-    Camera,
-    Doubles,
-    FieldRenderer,
-    GaussianField,
-    MapUncertainty,
-    RunError,
-    SplatStd,
-    SplatValues,
-    evenly_spaced,
-    harmonics,
-    morton_order,
-    se3,
-    smallest_three,
-    to_bytes,
-    write_text,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Doubles, GaussianField, RunError, SplatValues, harmonics, se3
 from sigmasplat.plugins.evaluation.run_views import refined_fx
 from sigmasplat.plugins.outputs.axes import Edge, levelled, transform_to
 from sigmasplat.plugins.outputs.drawing.colormap import INFERNO
@@ -67,9 +52,9 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
     keyframes = reader.poses_of(frames) if frames else trajectory
     poses = keyframes.T_world_camera
     field.keep(shown)
-    renderer = FieldRenderer(reader.config.render, reader.config.backend)
+    renderer = api.FieldRenderer(reader.config.render, reader.config.backend)
     best = best_view([*sample_surfaces(field, keyframes, reader.camera, renderer, VIEWS)])
-    start = int(evenly_spaced(len(poses), VIEWS)[best])
+    start = int(api.evenly_spaced(len(poses), VIEWS)[best])
     with torch.inference_mode():
         poster = renderer(field, reader.camera, se3.inverse(poses[start])).color.cpu().clamp(0.0, 1.0).numpy()
     R_floor_world, said, _ = levelled(reader, up)
@@ -83,20 +68,20 @@ def export_page(reader: RunReader, target: Path, up: Edge = "auto", most_bytes: 
         "path": positions.round(4).tolist(), "keyframes": (T @ poses).round(6).reshape(-1, 16).tolist(),
         "start": start, "bounds": [(ends.min(0) - margin).tolist(), (ends.max(0) + margin).tolist()],
         "width": reader.camera.width, "height": reader.camera.height, "focal": reader.camera.fx,
-        "refined_fx": refined_fx(reader.config, Camera(**run.facts()["camera"])), "palette": INFERNO.tolist(),
+        "refined_fx": refined_fx(reader.config, api.Camera(**run.facts()["camera"])), "palette": INFERNO.tolist(),
     }  # fmt: skip
     time_s = float(trajectory.timestamps_s[0])
     if time_s < 1e9:  # September 2001: it does not count from 1970, so it does not tell the day
         time_s = (run.path / "run.json").stat().st_mtime
     day = datetime.fromtimestamp(time_s, UTC)
     subtitle = f"{day:%-d %B %Y} · {len(reader.frames):,} frames · made with SigmaSplat"
-    write_text(target, page(run.path.resolve().name, subtitle, scene, data, poster))
+    api.write_text(target, page(run.path.resolve().name, subtitle, scene, data, poster))
     cut = len(values) - scene["count"]
     fewer = f"; {cut:,} that cover least are left out, for {most_bytes / 1e6:.0f} MB" if cut else ""
     return f"{scene['count']:,} splats, axes y-up ({said}){fewer}"
 
 
-def flat_colours(field: GaussianField, known: MapUncertainty | None) -> GaussianField:
+def flat_colours(field: GaussianField, known: api.MapUncertainty | None) -> GaussianField:
     """Return a copy without harmonics, in the colours seen from the mean direction of the keyframes if it is known.
 
     Raises RunError if a value is nan or inf.
@@ -112,7 +97,7 @@ def flat_colours(field: GaussianField, known: MapUncertainty | None) -> Gaussian
 
 
 def packed_within(
-    values: SplatValues, std: SplatStd | None, shown: NDArray[np.bool_], most_bytes: int
+    values: SplatValues, std: api.SplatStd | None, shown: NDArray[np.bool_], most_bytes: int
 ) -> tuple[bytes, dict[str, Any]]:
     """Return what `packed` does, in at most so many bytes: splats of the smallest opacity times area are left out."""
     areas = np.exp(np.sort(values.log_scales, axis=1)[:, 1:].sum(1))
@@ -133,16 +118,16 @@ def packed(values: SplatValues, std_m: Doubles | None, shown: NDArray[np.bool_])
     """
     if not shown.any():
         raise RunError("the map has no splat that is sure enough to be shown; make it again with more frames")
-    order = morton_order(values.means)
+    order = api.morton_order(values.means)
     order = order[np.argsort(~shown[order], kind="stable")]
     values, low = values.ordered(order), values.means.min(0)
     step = max(float((values.means.max(0) - low).max()), 1e-6) / 65535.0
     places = np.round((values.means - low) / step).astype(np.uint16).T
     scales, scale = logarithmic(np.exp(values.log_scales), SMALLEST_SCALE_M)
     stds, std = logarithmic(np.ones(len(values)) if std_m is None else std_m[order], SMALLEST_STD_M)
-    which, others = smallest_three(values.quats)
-    opacity, none = np.maximum(to_bytes(values.opacities * 255.0), 1), np.zeros(len(values))
-    parts, color = to_bytes((others.T * np.sqrt(2.0) + 1.0) * 127.5), to_bytes(values.colors.T * 255.0)
+    which, others = api.smallest_three(values.quats)
+    opacity, none = np.maximum(api.to_bytes(values.opacities * 255.0), 1), np.zeros(len(values))
+    parts, color = api.to_bytes((others.T * np.sqrt(2.0) + 1.0) * 127.5), api.to_bytes(values.colors.T * 255.0)
     planes = [*(places >> 8), opacity, *(places & 255), stds, *scales.T, which, *parts, none, *color, none]
     legend = [1.0, 2.0] if std_m is None else np.quantile(std_m[shown], [0.02, 0.98]).tolist()
     return gzip.compress(np.stack(planes).astype(np.uint8).tobytes(), compresslevel=9, mtime=0), {
@@ -155,7 +140,7 @@ def logarithmic(values: Doubles, smallest: float) -> tuple[NDArray[np.uint8], li
     """Return the logarithms of values as bytes, and the logarithm of byte 0 and of a step."""
     logs = np.log(np.maximum(values, smallest))
     low, step = float(logs.min()), max(float(np.ptp(logs)), 1e-6) / 255.0
-    return to_bytes((logs - low) / step), [low, step]
+    return api.to_bytes((logs - low) / step), [low, step]
 
 
 def page(title: str, subtitle: str, scene: dict[str, Any], data: bytes, poster: NDArray[np.floating[Any]]) -> str:
