@@ -35,8 +35,7 @@ from sigmasplat.data.frame_arrays import (
 )
 from sigmasplat.data.images import resized_color as resized_color
 from sigmasplat.data.mesh import Mesh as Mesh, mesh_depth as mesh_depth
-from sigmasplat.data.read_at_once import read_at_once as read_at_once
-from sigmasplat.data.readout import Readout as Readout, SensorTimes as SensorTimes
+from sigmasplat.data.readout import Readout as Readout, SensorTimes as SensorTimes, read_at_once as read_at_once
 from sigmasplat.data.submap import Picture as Picture, SubmapStore as SubmapStore
 from sigmasplat.data.trajectory import (
     APART as APART,

@@ -21,8 +21,7 @@ from image_definitions import (
 from sigmasplat.data import images, se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.read_at_once import depth_of_color, read_at_once
-from sigmasplat.data.readout import Readout, SensorTimes
+from sigmasplat.data.readout import Readout, SensorTimes, depth_of_color, read_at_once
 from sigmasplat.fit.compare import NOTHING, compare, noise_scale
 from sigmasplat.fit.cpu import halved, halved_depth
 from sigmasplat.fit.pyramid import HIDDEN_M, Pyramid

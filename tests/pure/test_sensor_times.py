@@ -10,8 +10,7 @@ import row_times
 from late_images import CAMERA, cast, frame, image
 from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
-from sigmasplat.data.read_at_once import read_at_once
-from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Readout, SensorTimes, readouts
+from sigmasplat.data.readout import AT_ONCE, UNKNOWN_TIMES, Readout, SensorTimes, read_at_once, readouts
 from sigmasplat.fit.align import Alignment, Pair as Aligned, align, normal_equations
 from sigmasplat.fit.compare import compare
 from sigmasplat.fit.pyramid import Pyramid

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from sigmasplat.data.camera import Camera
-from sigmasplat.data.read_at_once import depth_of_color
-from sigmasplat.data.readout import Readout
+from sigmasplat.data.readout import Readout, depth_of_color
 from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.interface import DEPTH_STEP_M, ImageKernels, Plane
 from sigmasplat.types import Matrix

@@ -11,8 +11,7 @@ from torch import Tensor
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.frame import Detail, Frame, Photo
-from sigmasplat.data.read_at_once import read_at_once
-from sigmasplat.data.readout import Readout
+from sigmasplat.data.readout import Readout, read_at_once
 from sigmasplat.data.submap import Picture
 from sigmasplat.fit.adam import VectorAdam
 from sigmasplat.native import _core
@@ -107,7 +106,7 @@ class Target:
         return replace(self, textured=self.with_depth(self.depth_image.numpy() * chosen))
 
     def read_at_once(self, readout: Readout) -> "Target":
-        """Return the images as the camera sees them at one time (`data.read_at_once`)."""
+        """Return the images as the camera sees them at one time (`data.readout`)."""
         frame = Frame(0, 0.0, self.image.numpy(), self.depth_image.numpy(), self.camera)
         rows, columns = self.depth.shape
         return Target.of(read_at_once(frame, readout), (rows, columns))

@@ -18,16 +18,7 @@ from sigmasplat.fit.adam import Rates
 from sigmasplat.fit.field import DensifyStats, FieldFit, fitting
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.fit.tracking_loss import PoseMaps
-from sigmasplat.mapping.densify import (
-    densify_mask,
-    fade,
-    multiply,
-    splat_uncertainty,
-    split,
-    still_uncertain,
-    too_large,
-    too_wide,
-)
+from sigmasplat.mapping import densify
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.mapping.seeding import first_pixels, later_pixels, make_splats, thin_out
 from sigmasplat.mapping.window import choose_window, dominating, draw_keyframes
@@ -266,19 +257,19 @@ class Mapper:
         large in it, up to the maximum number of splats."""
         p, most = self.config.primitives, self.config.seeding.max_splats
         room = max(most - len(self.field), 0) if most else len(self.field)
-        multiply(self.field, densify_mask(stats, p.split_gradient, room), p, self.random)
+        densify.multiply(self.field, densify.densify_mask(stats, p.split_gradient, room), p, self.random)
         if p.split_radius_px:
             T_camera_world = se3.inverse(self.keyframes[-1].T_world_camera)
-            coarse = too_wide(self.field, T_camera_world, view.camera, p.split_radius_px)
+            coarse = densify.too_wide(self.field, T_camera_world, view.camera, p.split_radius_px)
             coarse[coarse.nonzero()[max(most - len(self.field), 0) if most else len(coarse) :]] = False
-            split(self.field, coarse, self.random)
+            densify.split(self.field, coarse, self.random)
 
     def _fade_uncertain(self, view: View, window: list[Keyframe]) -> Tensor:
         """Fade the splats that contradict the depth readings of the window; return their ids."""
         p = self.config.primitives
         if not p.uncertain_m2:
             return self.field.ids[:0]
-        return fade(self.field, self._uncertainty_m2(view, window) > p.uncertain_m2, p.faded_opacity)
+        return densify.fade(self.field, self._uncertainty_m2(view, window) > p.uncertain_m2, p.faded_opacity)
 
     def _still_uncertain(self, view: View, window: list[Keyframe], faded: Tensor) -> Tensor:
         """Return which faded splats did not recover, bool [N]."""
@@ -286,18 +277,18 @@ class Mapper:
         if not len(faded):
             return torch.zeros_like(self.field.ids, dtype=torch.bool)
         nu_m2 = self._uncertainty_m2(view, window)
-        return still_uncertain(self.field, faded, nu_m2, p.uncertain_m2, p.least_opacity)
+        return densify.still_uncertain(self.field, faded, nu_m2, p.uncertain_m2, p.least_opacity)
 
     def _uncertainty_m2(self, view: View, window: list[Keyframe]) -> Tensor:
         """Return how far each splat [N] is from the depth readings of the window, or of the newest keyframe if there is
         no window, m²."""
         keyframes = window if self.config.mapping.window else window[:1]
-        return splat_uncertainty(self.field, view, keyframes)[0]
+        return densify.splat_uncertainty(self.field, view, keyframes)[0]
 
     def _prune(self, view: View, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""
         gone = self.field.opacities <= self.config.mapping.prune_opacity
-        gone |= too_large(self.field, self.config.primitives.most_scale_m)
+        gone |= densify.too_large(self.field, self.config.primitives.most_scale_m)
         self.field.keep(~(gone if also is None else gone | also))
 
 

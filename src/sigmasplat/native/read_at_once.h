@@ -1,4 +1,4 @@
-// What a camera saw at another time than its images were read. data/read_at_once.py is the description.
+// What a camera saw at another time than its images were read. data/readout.py is the description.
 
 using Points = Point3<vf>;
 struct Places { vf column, row; };

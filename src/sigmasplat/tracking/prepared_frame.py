@@ -11,8 +11,7 @@ from sigmasplat.config.input import sensor_model
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera, gray_exposure, unexposed
 from sigmasplat.data.frame import Frame, Photo, photo_size
-from sigmasplat.data.read_at_once import read_at_once
-from sigmasplat.data.readout import AT_ONCE, Readout, SensorTimes
+from sigmasplat.data.readout import AT_ONCE, Readout, SensorTimes, read_at_once
 from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
 from sigmasplat.fit.field import loss_weights

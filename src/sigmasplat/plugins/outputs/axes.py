@@ -15,17 +15,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory
-from sigmasplat.plugins.outputs.floorplan.ground import (
-    MEASURED_COS,
-    MIN_LEVEL_SHARE,
-    Edge as Edge,
-    Up,
-    floor_frame,
-    horizontal,
-    level_share,
-    sample_surfaces,
-    up_of,
-)
+from sigmasplat.plugins.outputs.floorplan import ground
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Axes = Literal["y-up", "z-up", "y-down", "camera"]
@@ -52,7 +42,7 @@ def transform_to(axes: Axes, R_floor_world: Matrix = R_FLOOR_CAMERA) -> Matrix:
     return T
 
 
-def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]:
+def levelled(reader: RunReader, edge: ground.Edge = "auto") -> tuple[Matrix, str, bool]:
     """Return R_floor_world [3, 3] of a run, x right, y ahead along the walls, z up; how up was found, in words; and
     whether level surfaces or an accelerometer confirm it.
 
@@ -61,21 +51,21 @@ def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]
     surface is visible. Raises RunError if the run has no map or no path.
     """
     field, path, config = reader.run.read_map(), reader.valid_path(), reader.config
-    up = up_of(path.T_world_camera, reader.run.facts(), edge)
-    samples = list(sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend)))
+    up = ground.up_of(path.T_world_camera, reader.run.facts(), edge)
+    samples = list(ground.sample_surfaces(field, path, reader.camera, FieldRenderer(config.render, config.backend)))
     try:
-        R = floor_frame(samples, up)[:3, :3]
-        share = level_share(samples, R[2])
+        R = ground.floor_frame(samples, up)[:3, :3]
+        share = ground.level_share(samples, R[2])
     except SigmaSplatError:
         R, share = level_cameras(path, up), 0.0
-    level = share > MIN_LEVEL_SHARE
+    level = share > ground.MIN_LEVEL_SHARE
     found = f"{share:.0%} of what is seen is level" if level else "no floor and no table confirms it"
-    return R, f"up is {up.how}; {found}", level or up.within_cos == MEASURED_COS
+    return R, f"up is {up.how}; {found}", level or up.within_cos == ground.MEASURED_COS
 
 
-def level_cameras(path: Trajectory, up: Up | None = None) -> Matrix:
+def level_cameras(path: Trajectory, up: ground.Up | None = None) -> Matrix:
     """Return R_floor_world [3, 3] without a map: z is up, by default as the cameras are held; y is level and ahead."""
     poses = path.T_world_camera
-    z = (up or up_of(poses)).up
-    ahead = horizontal(poses[0], z)
+    z = (up or ground.up_of(poses)).up
+    ahead = ground.horizontal(poses[0], z)
     return np.stack([np.cross(ahead, z), ahead, z])

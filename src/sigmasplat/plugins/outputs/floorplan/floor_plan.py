@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 import sigmasplat.api as api
 from sigmasplat.api import Camera, Matrix, Progress, Trajectory
 from sigmasplat.plugins.evaluation.view_scores import Renderer
-from sigmasplat.plugins.outputs.floorplan.ground import (
-    Edge,
-    SurfacePredictor,
-    SurfaceSample,
-    Up,
-    floor_frame,
-    sample_surfaces,
-    up_of,
-)
+from sigmasplat.plugins.outputs.floorplan import ground
 
 CELL_M = 0.05
 UNOBSERVED, FLOOR_UNOBSERVED, FREE, OBJECT, WALL = range(5)
@@ -88,7 +80,7 @@ class FloorPlan:
 
 def floor_plan(
     field: api.GaussianField, trajectory: Trajectory, camera: Camera, *, cell_m: float = CELL_M,
-    renderer: Renderer = api.render, predictor: SurfacePredictor | None = None, up: Up | None = None,
+    renderer: Renderer = api.render, predictor: ground.SurfacePredictor | None = None, up: ground.Up | None = None,
     progress: Progress = api.no_progress,
 ) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a map from poses along its path; `camera` gives the field of view.
@@ -99,8 +91,8 @@ def floor_plan(
     """
     if not 0.001 <= cell_m <= 1.0:
         raise api.ConfigError(f"a cell of the floor plan must be 0.001 to 1 m wide, found {cell_m}")
-    samples = list(sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
-    T_floor_world = floor_frame(samples, up)
+    samples = list(ground.sample_surfaces(field, trajectory, camera, renderer, progress=progress, predictor=predictor))
+    T_floor_world = ground.floor_frame(samples, up)
 
     def to_floor(points: NDArray[np.floating]) -> Matrix:
         return np.asarray(points.astype(np.float64) @ T_floor_world[:3, :3].T + T_floor_world[:3, 3])
@@ -116,7 +108,7 @@ def floor_plan(
 
 
 def run_floor_plan(
-    run: api.RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, up: Edge = "auto",
+    run: api.RunFolder, path: Trajectory, camera: Camera, *, cell_m: float = CELL_M, up: ground.Edge = "auto",
     progress: Progress = api.no_progress,
 ) -> FloorPlan:  # fmt: skip
     """Make the floor plan of a run's map.
@@ -133,7 +125,7 @@ def run_floor_plan(
         predictor = partial(api.predict, field, known, options=config.render, backend=config.backend)
     return floor_plan(
         field, path, camera, cell_m=cell_m, renderer=api.FieldRenderer(config.render, config.backend),
-        predictor=predictor, up=up_of(path.T_world_camera, run.facts(), up), progress=progress,
+        predictor=predictor, up=ground.up_of(path.T_world_camera, run.facts(), up), progress=progress,
     )  # fmt: skip
 
 
@@ -181,7 +173,7 @@ class _Cells:
             inside &= (at[:, 2] > LOW_M) & (at[:, 2] < HIGH_M)
             self.passed[np.unique(cell[inside])] += 1
 
-    def add_points(self, points: Matrix, sample: SurfaceSample) -> None:
+    def add_points(self, points: Matrix, sample: ground.SurfaceSample) -> None:
         """Add surface points: their number per layer of height, and their measurements."""
         cell, inside = self.cell_index(points)
         standing = inside & (points[:, 2] > LOW_M) & (points[:, 2] < HIGH_M)
