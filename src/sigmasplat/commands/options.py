@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from sigmasplat import env
-from sigmasplat.commands.bag_options import Bag, BagImages
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, From0, From1, InputOptions, Whole, arg, flag
 from sigmasplat.config import Config, InputConfig
 from sigmasplat.config.find_preset import FAMILIES, preset as preset_of
@@ -71,6 +70,10 @@ PosesFile = Annotated[
     Path | None, arg("FILE", "file to write: .jsonl (all results) or .txt (poses as TUM text)", "(default: none)")
 ]
 RunOrMap = Annotated[Path, tyro.conf.Positional, arg("RUN", "run folder, or a map as PLY")]
+Bag = Annotated[
+    Path | None, arg("DIR", "also write a ROS 2 bag (MCAP): transforms, odometry, images; needs no ROS", "")
+]
+BagImages = Annotated[Literal["none", "keyframes", "all"], arg(None, "which images the bag contains, uncompressed")]
 
 
 @dataclass(frozen=True)

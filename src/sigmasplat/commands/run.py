@@ -3,13 +3,13 @@
 The order of a run: open the source, start the viewer, create the run folder, run the session (`run/session.py`), score.
 """
 
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sigmasplat.commands import bag_options, options
+from sigmasplat.commands import options
 from sigmasplat.commands.evaluate import score
 from sigmasplat.commands.input_options import DEFAULT_INPUT_OPTIONS, InputOptions, InputOptionsFlat
 from sigmasplat.commands.options import configured, prepare_torch, source_of
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sigmasplat.run.resume import StartPoint
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
+    from sigmasplat.system.slam import Slam
 
 OK, INTERRUPTED = 0, 130
 DEFAULT_PRESET = default_preset()
@@ -70,7 +71,7 @@ def run(
     from sigmasplat.run_folder.runs import RunFolder
     from sigmasplat.system.slam import Slam
 
-    bag_options.check_robot_output(run_options.bag)
+    _check_robot_output(run_options.bag)
     settings += () if final_seconds is None else (f"final.seconds={final_seconds:g}",)
     screen, earlier = Screen(), FinishedMap.of(RunFolder.open(onto)) if onto else None
     config = configured(preset, settings, seed, input_options, earlier.config if earlier else None)
@@ -103,7 +104,7 @@ def resume(
     from sigmasplat.run.terminal import Screen
     from sigmasplat.run_folder.runs import RunFolder
 
-    bag_options.check_robot_output(run_options.bag)
+    _check_robot_output(run_options.bag)
     screen, folder = Screen(), RunFolder.open(run)
     source = source_of(folder, moved_to)
     prepare_torch()
@@ -224,7 +225,7 @@ def _run_and_score(
         folder.note(realtime=True)
     motion = MotionWatch(screen.warn)
     with (
-        bag_options.robot_output(screen, start.slam, folder, run_options.bag, run_options.bag_images) as robot,
+        _robot_output(screen, start.slam, folder, run_options) as robot,
         screen.steps(None if source.live else len(source), start.next_index) as steps,
     ):
         session = Session(
@@ -254,6 +255,34 @@ def _run_and_score(
     if viewer:
         keep_showing(screen, viewer, folder)
     return OK
+
+
+def _check_robot_output(bag: Path | None) -> None:
+    """Raise RunError before anything else starts if the bag exists or its folder cannot be written, SourceError if the
+    package is missing."""
+    if bag is not None:
+        from sigmasplat.plugins.robots.bag import BagSink
+
+        BagSink(bag)
+
+
+@contextmanager
+def _robot_output(
+    screen: "Screen", slam: "Slam", folder: "RunFolder", run_options: options.RunOptions
+) -> Iterator["LiveRobot | None"]:
+    """Yield the callback that feeds the bag, None if it is not requested; at the end complete it and note in run.json
+    how many messages were written."""
+    if run_options.bag is None:
+        yield None
+        return
+    from sigmasplat.plugins.robots.bag import LiveRobot
+
+    robot = LiveRobot(slam, run_options.bag, screen.warn, run_options.bag_images)
+    try:
+        yield robot
+    finally:
+        robot.close()
+        folder.note(bag={"written": robot.written, "failure": robot.failure})
 
 
 def _readers(
