@@ -110,7 +110,7 @@ def read_calibration(
     """
     written, read = read_json_object(path), Origin("", f"read from {path}")
     fields = (asdict(known.camera) if known else {}) | written
-    units = json_number(path, fields, "depth_scale", known.depth_units_per_metre if known else default_units_per_metre)
+    default = known.depth_units_per_metre if known else default_units_per_metre
     sensor = written.get("sensor", known.sensor if known else None)
     if sensor and (problem := problem_of(kinds_of(InputConfig)["sensor"], sensor)):
         raise SourceError(f'{path}: field "sensor" {problem}')
@@ -119,7 +119,7 @@ def read_calibration(
     origins |= {"depth unit": read} if "depth_scale" in written else {}
     if "camera" in origins and "fx" in written and not {"width", "height"} <= written.keys():
         origins["size of the calibration"] = Origin("that of the images", ASSUMED, f"width and height in {path}")
-    camera, scale = read_camera(path, fields, size), check_positive(path, "depth_scale", units)
+    camera, scale = read_camera(path, fields, size), positive_number(path, fields, "depth_scale", default)
     lens = known.distortion if known and "distortion" not in written else read_distortion(path, written)
     calibration = replace(
         known or Calibration(camera, scale), camera=camera, depth_units_per_metre=scale, distortion=lens,
@@ -205,9 +205,9 @@ def json_number(path: Path, fields: dict[str, Any], key: str, default: float | N
     return float(value)
 
 
-def check_positive(path: Path, key: str, value: float) -> float:
-    """Return a number that must be positive. Raises SourceError naming file and field."""
-    if value <= 0:
+def positive_number(path: Path, fields: dict[str, Any], key: str, default: float | None = None) -> float:
+    """Return a number as `json_number` does. Raises SourceError too if it is not above 0."""
+    if (value := json_number(path, fields, key, default)) <= 0:
         raise SourceError(f'{path}: field "{key}" is {value:g}, it must be above 0')
     return value
 

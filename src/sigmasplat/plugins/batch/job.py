@@ -9,16 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import sigmasplat
-from sigmasplat.api import (
-    INSTALLED,
-    Config,
-    RunFolder,
-    SigmaSplatError,
-    SourceError,
-    code_digest,
-    config_of_facts,
-    read_json,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Config, SigmaSplatError
 
 FACT = "batch"
 """The entry of run.json that says which job a run folder belongs to."""
@@ -52,7 +44,7 @@ class Job:
             return self.paths[0]
         found = [place for place in (Path(data) / path for path in self.paths) if place.exists()]
         if not found:
-            raise SourceError(f"no {self.paths[0]} in {data}")
+            raise api.SourceError(f"no {self.paths[0]} in {data}")
         return str(found[0].resolve())
 
     def facts(self) -> dict[str, Any]:
@@ -62,10 +54,10 @@ class Job:
     def started_in(self, folder: Path) -> bool:
         """Return whether a folder has a run of this job, with the same settings, code and scores."""
         facts = _facts(folder)
-        noted, used = facts.get(FACT), config_of_facts(facts, self.config, self.given)
+        noted, used = facts.get(FACT), api.config_of_facts(facts, self.config, self.given)
         with suppress(SigmaSplatError):
             if isinstance(noted, dict) and self.facts().items() <= noted.items():
-                return bool(read_json(folder / "config.json") == json.loads(json.dumps(used.to_dict())))
+                return bool(api.read_json(folder / "config.json") == json.loads(json.dumps(used.to_dict())))
         return False
 
     def finished_in(self, folder: Path) -> bool:
@@ -80,7 +72,7 @@ def has_other_run(job: Job, folder: Path) -> bool:
 
 def _facts(folder: Path) -> Mapping[str, Any]:
     try:
-        return RunFolder(folder).facts()
+        return api.RunFolder(folder).facts()
     except SigmaSplatError:
         return {}
 
@@ -88,4 +80,4 @@ def _facts(folder: Path) -> Mapping[str, Any]:
 @cache
 def installed_code() -> str:
     """Return the digest of the installed code. Runs with other code are never mixed in one table."""
-    return code_digest(Path(sigmasplat.__file__).parent, INSTALLED)
+    return api.code_digest(Path(sigmasplat.__file__).parent, api.INSTALLED)

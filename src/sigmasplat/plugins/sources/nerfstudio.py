@@ -66,7 +66,7 @@ def _open(
     sure = [api.listed_file(folder, name) if isinstance(name := f.get("confidence"), str) else None for f in frames]
     images = [api.ImagePair(float(t), *pair, confidence=c) for t, pair, c in zip(times_s, files, sure, strict=True)]
     key = next((key for key in UNIT_KEYS if key in fields), "")
-    units = round(1.0 / api.check_positive(path, key, api.json_number(path, fields, key, METRES_PER_UNIT)), 6)
+    units = round(1.0 / api.positive_number(path, fields, key, METRES_PER_UNIT), 6)
     known = api.read_transforms_camera(path, fields, frames, api.first_size([i.color for i in images]), units)
     known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
     truth = truth or api.build_trajectory(zip(times_s, (api.read_pose(path, frame) for frame in frames), strict=True))

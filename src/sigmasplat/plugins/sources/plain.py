@@ -100,9 +100,7 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
     folder = Path(path)
     file = api.first_file(folder, INTRINSIC_NAMES)
     fields = api.read_json_object(file) if file else {}
-    rate = api.check_positive(
-        file or folder, "fps", api.json_number(file or folder, fields, "fps", api.FRAMES_PER_SECOND)
-    )
+    rate = api.positive_number(file or folder, fields, "fps", api.FRAMES_PER_SECOND)
     colors = api.list_images(api.first_subfolder(folder, api.COLOR_FOLDERS), api.COLOR_ENDINGS)
     depths = api.list_images(folder / "depth", api.DEPTH_ENDINGS)
     if colors and depths and all(_TIMED.fullmatch(path.stem) for path in colors + depths):
@@ -133,7 +131,7 @@ def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
         raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
     fx, fy, cx, cy = (api.json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
     width, height = (int(api.json_number(path, fields, key)) for key in ("width", "height"))
-    units = api.check_positive(path, "depth_scale", api.json_number(path, fields, "depth_scale", api.MM_PER_METRE))
+    units = api.positive_number(path, fields, "depth_scale", api.MM_PER_METRE)
     read = Origin("", f"read from {path.name}")
     origins = {"camera": read} | ({"depth unit": read} if "depth_scale" in fields else {})
     return Calibration(api.build_camera(path, width, height, [fx, fy, cx, cy]), units, origins=origins)

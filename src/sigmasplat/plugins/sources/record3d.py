@@ -159,7 +159,8 @@ def _times_s(where: Path, metadata: dict[str, Any], numbers: list[int]) -> NDArr
     times = metadata.get("frameTimestamps")
     if isinstance(times, list) and len(times) > numbers[-1]:
         return np.array([api.json_number(where, {"frameTimestamps": times[n]}, "frameTimestamps") for n in numbers])
-    return np.array(numbers) / (api.check_positive(where, "fps", api.json_number(where, metadata, "fps", 60.0) or 60.0))
+    fps = api.json_number(where, metadata, "fps", 60.0) or 60.0
+    return np.array(numbers) / api.positive_number(where, {"fps": fps}, "fps")
 
 
 def _truth(

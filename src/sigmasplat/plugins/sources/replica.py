@@ -38,12 +38,10 @@ def _calibration(path: Path) -> Calibration:
     fields = api.read_json_object(path).get("camera")
     if not isinstance(fields, dict):
         raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
-    w, h, *focal, scale = (api.json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy", "scale"))
+    w, h, *focal = (api.json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy"))
+    camera, scale = api.build_camera(path, int(w), int(h), focal), api.positive_number(path, fields, "scale")
     read = api.Origin("", f"read from {path.name}")
-    return Calibration(
-        api.build_camera(path, int(w), int(h), focal), api.check_positive(path, "scale", scale),
-        origins={"camera": read, "depth unit": read},
-    )  # fmt: skip
+    return Calibration(camera, scale, origins={"camera": read, "depth unit": read})
 
 
 def _truth(path: Path, numbers: list[int]) -> api.Trajectory | None:

@@ -61,7 +61,7 @@ def open_stereo(place: str, settings: api.InputConfig) -> StereoSource:
         raise SourceError(f"{folder}: the baseline of the stereo pair is unknown; write {path} with baseline_m, metres")
     if found.distortion and settings.undistort:
         raise SourceError(f'{path}: field "distortion" is given, but a stereo pair must be rectified; rectify it first')
-    baseline_m = api.check_positive(path, "baseline_m", api.json_number(path, api.read_json_object(path), "baseline_m"))
+    baseline_m = api.positive_number(path, api.read_json_object(path), "baseline_m")
     truth = api.read_groundtruth(folder)
     if settings.depth_scale:
         raise SourceError(f"{name}: input.depth_scale does not apply to a stereo pair; correct its baseline")

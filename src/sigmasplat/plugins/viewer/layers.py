@@ -9,17 +9,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from torch import Tensor
 
-from sigmasplat.api import (
-    Camera,
-    GaussianField,
-    MapUncertainty,
-    Matrix,
-    RenderConfig,
-    predicted,
-    render,
-    se3,
-    variance_parts,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Camera, GaussianField, RenderConfig, se3
 from sigmasplat.plugins.evaluation.view_scores import COVERED_ALPHA, as_array
 from sigmasplat.plugins.outputs.drawing import colormap
 from sigmasplat.plugins.outputs.drawing.view_panels import colour_bar
@@ -82,7 +73,7 @@ class ShownMap(NamedTuple):
     """The splats that are shown, in the world frame, how sure they are if measured, and how they are rendered."""
 
     field: GaussianField
-    known: MapUncertainty | None
+    known: api.MapUncertainty | None
     options: RenderConfig
     backend: str
 
@@ -133,7 +124,7 @@ def browser_camera(fov: float, aspect: float, height: int) -> Camera:
     return Camera(width, height, float(f), float(f), 0.5 * (width - 1), 0.5 * (height - 1))
 
 
-def render_layer(shown: ShownMap, camera: Camera, T_world_camera: Matrix, layer: str) -> LayerImage:
+def render_layer(shown: ShownMap, camera: Camera, T_world_camera: api.Matrix, layer: str) -> LayerImage:
     """Render a map and draw one layer of the result.
 
     Layers: colour; depth D̂/A in m; V: √V averaged over the channels, colours being 0 to 1 (VarSplat §1); U: √U about
@@ -144,12 +135,12 @@ def render_layer(shown: ShownMap, camera: Camera, T_world_camera: Matrix, layer:
     T_camera_world = se3.inverse(T_world_camera)
     with torch.no_grad():
         if layer in PREDICTED_MODES and known is not None:
-            parts = variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
-            found, covered = predicted(parts, known.calibration), as_array(parts.alpha) > COVERED_ALPHA
+            parts = api.variance_parts(field, known.splats, known.background, camera, T_camera_world, options, backend)
+            found, covered = api.predicted(parts, known.calibration), as_array(parts.alpha) > COVERED_ALPHA
             if layer == "color error":
                 return _from_zero(as_array(found.color.sqrt()), np.ones_like(covered), "")
             return _from_zero(as_array(found.depth_std_m), covered, " m")
-        seen = render(field, camera, T_camera_world, None, options, backend)
+        seen = api.render(field, camera, T_camera_world, None, options, backend)
         alpha = as_array(seen.alpha)
         covered = alpha > COVERED_ALPHA
         depth_m = np.where(covered, as_array(seen.depth) / np.maximum(alpha, COVERED_ALPHA), 0.0).astype(np.float32)
@@ -161,7 +152,7 @@ def render_layer(shown: ShownMap, camera: Camera, T_world_camera: Matrix, layer:
             return _from_zero(as_array(seen.variance.mean(2).clamp(min=0.0).sqrt()), covered, "")
         if layer != "U":
             raise ValueError(f"no layer {layer!r} is rendered")
-        spread = render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
+        spread = api.render(field, camera, T_camera_world, torch.from_numpy(depth_m), options, backend).uncertainty
         assert spread is not None
         about = np.sqrt(np.maximum(as_array(spread), 0.0) / np.maximum(alpha, COVERED_ALPHA))
         return _from_zero(about, covered, " m")
