@@ -8,8 +8,8 @@ from sigmasplat.errors import SourceError
 from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.plugins.sources.room.corridor import AWAY_M, PAINTS, TILE_M, WALL_STEP_M, wall_sections
 from sigmasplat.plugins.sources.room.render import build_scene, render_scene
-from sigmasplat.plugins.sources.room.wall import AWAY_M, PAINTS, STEP_M, TILE_M, wall_sections
 from sigmasplat.tracking.pose_validation import DOUBTFUL, SURE, p_wrong
 
 PAINTED, TILED, BLANK = (PAINTS.index(name) + 1 for name in ("painted", "tiles", "blank"))
@@ -24,7 +24,7 @@ def test_every_ray_hits_the_wall_and_the_camera_moves_along_it(frames: int) -> N
     source = wall(BLANK, frames)
     T = source.truth().T_world_camera
     assert all(se3.is_rigid(pose, 1e-9) for pose in T)
-    np.testing.assert_allclose(np.diff(T[:, 0, 3]), STEP_M)
+    np.testing.assert_allclose(np.diff(T[:, 0, 3]), WALL_STEP_M)
     for i in (0, frames - 1):
         depth_m = source.exact_depth_of(i)
         assert depth_m.min() > AWAY_M * 0.95 and depth_m.max() < AWAY_M * 1.05

@@ -20,18 +20,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from sigmasplat.api import (
-    PLY_TYPES,
-    Element,
-    Mesh,
-    RunError,
-    SourceError,
-    header_of,
-    open_binary,
-    read_header,
-    replacing,
-    to_bytes,
-)
+import sigmasplat.api as api
+from sigmasplat.api import Mesh, RunError, SourceError
 from sigmasplat.plugins.outputs.mesh_texture import TexturedMesh, vertex_colors
 
 Values = NDArray[np.floating]
@@ -134,7 +124,7 @@ def write_mesh(path: Path, mesh: Mesh, note: str = NOTE) -> None:
     """
     check_ending(path)
     content = _FORMATS[path.suffix.lower()](mesh, note)
-    with replacing(path) as temporary:
+    with api.replacing(path) as temporary:
         temporary.write_bytes(content)
 
 
@@ -150,8 +140,8 @@ def read_mesh(path: Path) -> Mesh:
     All faces have the same number of vertices; polygons such as the quads of Replica are divided into triangles.
     Raises SourceError if it is missing, truncated, not such a PLY, or not a valid mesh.
     """
-    with open_binary(path, "cannot read mesh") as file:
-        rows = {element.name: _rows(file, path, element) for element in read_header(file, path)}
+    with api.open_binary(path, "cannot read mesh") as file:
+        rows = {element.name: _rows(file, path, element) for element in api.read_header(file, path)}
     vertices, faces = rows.get("vertex"), rows.get("face")
     if vertices is None or faces is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise SourceError(f"{path} is not a mesh: it needs vertices with x, y, z and faces; is it a point cloud?")
@@ -177,14 +167,14 @@ def _colors(vertices: NDArray[np.void]) -> NDArray[np.float32] | None:
     return np.clip(colors / np.float32(scale), 0.0, 1.0).astype(np.float32)
 
 
-def _rows(file: BinaryIO, path: Path, element: Element) -> NDArray[np.void]:
+def _rows(file: BinaryIO, path: Path, element: api.Element) -> NDArray[np.void]:
     """Read one element. All lists are read with the length of the first one; their lengths are column "NAME count"."""
     fields: list[tuple[str, str] | tuple[str, str, int]] = []
     length, order, count = 0, element.order, element.count
     if count < 0:
         raise SourceError(f"{path}: its header has no number of '{element.name}'; save the mesh again")
     for words in element.properties:
-        kinds = [PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
+        kinds = [api.PLY_TYPES.get(word) for word in words[:-1] if word != "list"]
         if None in kinds or len(kinds) != (2 if words[0] == "list" else 1):
             raise SourceError(f"{path}: cannot read the PLY's properties ({' '.join(words)})")
         if len(kinds) == 2:
@@ -216,16 +206,20 @@ def _ply(mesh: Mesh, note: str) -> bytes:
     faces["count"], faces["corners"] = 3, mesh.faces
     groups: list[tuple[str, str, NDArray[Any] | None]] = [
         ("x y z", "float", mesh.vertices), ("nx ny nz", "float", mesh.normals()),
-        ("red green blue", "uchar", to_bytes(vertex_colors(mesh) * 255.0)),
+        ("red green blue", "uchar", api.to_bytes(vertex_colors(mesh) * 255.0)),
         ("depth_std_m", "float", mesh.depth_std_m), ("filled", "uchar", mesh.filled),
     ]  # fmt: skip
     known = [(names.split(), kind, values) for names, kind, values in groups if values is not None]
-    vertices = np.zeros(len(mesh.vertices), [(names[0], f"<{PLY_TYPES[kind]}", len(names)) for names, kind, _ in known])
+    vertices = np.zeros(
+        len(mesh.vertices), [(names[0], f"<{api.PLY_TYPES[kind]}", len(names)) for names, kind, _ in known]
+    )
     for names, _, values in known:
         vertices[names[0]] = values.reshape(-1, len(names))
     columns = [f"{kind} {name}" for names, kind, _ in known for name in names]
     corners = ("face", len(faces), ["list uchar int vertex_indices"])
-    return header_of(("vertex", len(vertices), columns), corners, comment=note) + vertices.tobytes() + faces.tobytes()
+    return (
+        api.header_of(("vertex", len(vertices), columns), corners, comment=note) + vertices.tobytes() + faces.tobytes()
+    )
 
 
 def _stl(mesh: Mesh, note: str) -> bytes:

@@ -11,11 +11,10 @@ import sigmasplat.api as api
 from sigmasplat.api import Camera, Frame, Matrix, Mesh, Source, SourceError, SourceFormat, Trajectory, se3
 from sigmasplat.plugins.sources.room import capture
 from sigmasplat.plugins.sources.room.capture import Image, camera_path
-from sigmasplat.plugins.sources.room.corridor import corridor_path, sections
+from sigmasplat.plugins.sources.room.corridor import PAINTS, corridor_path, sections, wall_path, wall_sections
 from sigmasplat.plugins.sources.room.furnish import mask_of, mover as moving_ball
 from sigmasplat.plugins.sources.room.render import RoomScene, build_scene, furnished, render_scene
 from sigmasplat.plugins.sources.room.shapes import triangulate
-from sigmasplat.plugins.sources.room.wall import PAINTS, wall_path, wall_sections
 from sigmasplat.plugins.sources.stereo_matching import StereoMatcher
 
 FRAMES_PER_SECOND = 30.0

@@ -1,8 +1,9 @@
-"""A long corridor with plain walls, and the way along it: only fine speckle shows how far the camera has gone.
+"""Long scenes along which a camera is carried: a corridor with plain walls, and a wall seen from the front.
 
-Edges along the corridor (skirting, handrails, a duct below the ceiling) and depth look alike from everywhere, and the
-speckle is seen on near walls only. In small images, few pixels of it stand against all these edges. So alignment from
-coarse to fine slides along the corridor, although depth agrees; images of full size alone do not let it slide.
+In the corridor only fine speckle shows how far the camera has gone, at the wall only its paint, not depth. Edges along
+the corridor (skirting, handrails, a duct below the ceiling) and depth look alike from everywhere, and the speckle is
+seen on near walls only. In small images, few pixels of it stand against all these edges. So alignment from coarse to
+fine slides along the corridor, although depth agrees; images of full size alone do not let it slide.
 """
 
 import numpy as np
@@ -11,14 +12,14 @@ from sigmasplat.api import Matrix
 from sigmasplat.plugins.sources.room.capture import pose
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HEIGHT_M, PITCH_M, WALL_M, Room
 from sigmasplat.plugins.sources.room.shapes import Shape
-from sigmasplat.plugins.sources.room.textures import painting, plain
+from sigmasplat.plugins.sources.room.textures import painting, plain, tiles
 
 HALF_WIDTH_M, STEP_M = 1.1, 0.08
 """Half of the width, and the distance between the cameras of successive frames."""
 START_X_M, AHEAD_M = -1.8, 5.0
 """Place of the first frame, and the least length of the corridor beyond the last one."""
 EYE_M, SWAY_M, BOB_M = 1.45, 0.12, 0.03
-"""Height of the camera, and how far it sways to the sides and up."""
+"""Height of the camera in both, and how far it sways to the sides and up."""
 DOWN_RAD, YAW_RAD, PITCH_RAD, ROLL_RAD = np.deg2rad([4.0, 7.0, 3.0, 1.0])
 """How far the camera looks down on average, and how far it turns from there."""
 PERIODS = {"sway": 61, "bob": 17, "yaw": 83, "pitch": 47}
@@ -62,10 +63,45 @@ def furnish_corridor(count: int, seed: int) -> list[list[Shape]]:
 
 def corridor_path(frames: int, seed: int) -> Matrix:
     """Return T_world_camera [frames, 4, 4] of a camera that is carried along the corridor, `STEP_M` a frame."""
-    i, random = np.arange(frames), np.random.default_rng((seed, 14))
-    wave = {name: np.sin(2 * np.pi * (i / period + random.uniform())) for name, period in PERIODS.items()}
+    wave = _waves(frames, (seed, 14), PERIODS)
     y, z = SWAY_M * wave["sway"], EYE_M + BOB_M * wave["bob"]
     ahead_m = np.sqrt(STEP_M**2 - np.diff(y) ** 2 - np.diff(z) ** 2)
     x = START_X_M + np.concatenate([[0.0], np.cumsum(ahead_m)])
     angles = YAW_RAD * wave["yaw"], PITCH_RAD * wave["pitch"] - DOWN_RAD, ROLL_RAD * wave["bob"]
     return np.stack([pose(at, *turned) for at, *turned in zip(np.column_stack([x, y, z]), *angles, strict=True)])
+
+
+def _waves(frames: int, seed: tuple[int, int], periods: dict[str, int]) -> dict[str, Matrix]:
+    """Return sine waves [frames] of amplitude 1 with random phases, by name."""
+    i, random = np.arange(frames), np.random.default_rng(seed)
+    return {name: np.sin(2 * np.pi * (i / period + random.uniform())) for name, period in periods.items()}
+
+
+AWAY_M, WALL_STEP_M, MARGIN_M = 1.2, 0.07, 2.0
+"""Distance of the camera from the wall, its motion from frame to frame, and what the wall is longer than the way."""
+NOD_RAD, WALL_PERIODS = 0.02, {"bob": 31, "nod": 43}
+"""How far it nods at the wall; frames in one period of how far it bobs up and down, and nods."""
+COLOR, JOINT, TILE_M = (0.78, 0.76, 0.72), (0.45, 0.44, 0.42), 0.3
+PAINTS = ("painted", "tiles", "blank")
+
+
+def wall_sections(frames: int) -> int:
+    """Return the number of sections, each as long as a room, of a wall for this number of frames."""
+    return int(np.ceil((frames * WALL_STEP_M + 2 * MARGIN_M) / PITCH_M))
+
+
+def furnish_wall(count: int, seed: int, paint: int) -> list[list[Shape]]:
+    """Build a wall as long as `count` sections, painted as `PAINTS` says, from 1 on; return its shapes, all as of one
+    section."""
+    paints = plain(COLOR, 0.5, 0.12, 1000 * seed), tiles(COLOR, JOINT, TILE_M), plain(COLOR, 0.0)  # as in PAINTS
+    whole, middle_x = Room(0, seed), (count - 1) * PITCH_M / 2
+    half = PITCH_M * count / 2, WALL_M / 2, HEIGHT_M
+    whole.place("box", (middle_x, WALL_M / 2, HEIGHT_M / 2), half, paints[paint - 1])
+    return [whole.shapes]
+
+
+def wall_path(frames: int, seed: int) -> Matrix:
+    """Return T_world_camera [frames, 4, 4] of a camera that is carried along the wall, `WALL_STEP_M` a frame."""
+    wave, x = _waves(frames, (seed, 15), WALL_PERIODS), MARGIN_M - HALF_X_M + WALL_STEP_M * np.arange(frames)
+    at = np.column_stack([x, np.full(frames, -AWAY_M), EYE_M + BOB_M * wave["bob"]])
+    return np.stack([pose(each, np.pi / 2, pitch, 0.0) for each, pitch in zip(at, NOD_RAD * wave["nod"], strict=True)])

@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from sigmasplat.api import Camera, Matrix, se3
 from sigmasplat.plugins.sources.room.capture import Image
-from sigmasplat.plugins.sources.room.corridor import furnish_corridor
+from sigmasplat.plugins.sources.room.corridor import furnish_corridor, furnish_wall
 from sigmasplat.plugins.sources.room.furnish import HALF_X_M, HALF_Y_M, HEIGHT_M, PITCH_M, WALL_M, furnish_rooms
 from sigmasplat.plugins.sources.room.shapes import (
     CUBE,
@@ -25,7 +25,6 @@ from sigmasplat.plugins.sources.room.shapes import (
     surface_at,
 )
 from sigmasplat.plugins.sources.room.textures import Floats
-from sigmasplat.plugins.sources.room.wall import furnish_wall
 
 CELL_M, AMBIENT_REACH_M = 0.14, 0.7
 """Distance of the lattice's points, and the largest one at which a surface reduces the ambient light."""
