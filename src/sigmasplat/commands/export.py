@@ -46,8 +46,7 @@ class ExportOptions:
         arg("S", "length of a video in seconds", "(default: that of the path, 4 to 20; orbit: 12)"),
     ] = None  # fmt: skip
     path: Annotated[
-        Literal["run", "orbit"],
-        arg(None, "camera path of a video: along the run's path, or around the room"),
+        Literal["run", "orbit"], arg(None, "camera path of a video: along the run's path, or around the room")
     ] = "run"
     panels: Annotated[
         Literal["all", "color"],

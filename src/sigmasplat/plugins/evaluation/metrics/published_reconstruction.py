@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from sigmasplat.api import Camera, Matrix, Mesh, Progress, mesh_depth, no_progress, se3
-from sigmasplat.plugins.evaluation.metrics.reconstruction import (
-    COMPLETE_M,
-    POINTS,
-    correct,
-    mean,
-    nearest_m,
-    share,
-)
+from sigmasplat.plugins.evaluation.metrics.reconstruction import COMPLETE_M, POINTS, correct, mean, nearest_m, share
 from sigmasplat.plugins.evaluation.metrics.trajectory import align_rigid
 from sigmasplat.plugins.outputs.video import look_along
 
