@@ -54,7 +54,7 @@ def test_depth_is_that_of_the_left_image(tmp_path):
 
 def test_a_frame_reads_each_image_once(tmp_path, monkeypatch):
     source, read = open_source(tum_like(tmp_path)), []
-    monkeypatch.setattr(stereo, "read_color", lambda path: read.append(path.parent.name) or read_color(path))
+    monkeypatch.setattr(stereo.api, "read_color", lambda path: read.append(path.parent.name) or read_color(path))
     source.frame(1)
     assert sorted(read) == ["rgb", "right"]
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from sigmasplat.api import FieldRenderer, Matrix, SigmaSplatError, Trajectory
 from sigmasplat.plugins.outputs.floorplan import ground
+from sigmasplat.plugins.outputs.floorplan.ground import Edge as Edge
 from sigmasplat.plugins.outputs.run_reader import RunReader
 
 Axes = Literal["y-up", "z-up", "y-down", "camera"]
@@ -42,7 +43,7 @@ def transform_to(axes: Axes, R_floor_world: Matrix = R_FLOOR_CAMERA) -> Matrix:
     return T
 
 
-def levelled(reader: RunReader, edge: ground.Edge = "auto") -> tuple[Matrix, str, bool]:
+def levelled(reader: RunReader, edge: Edge = "auto") -> tuple[Matrix, str, bool]:
     """Return R_floor_world [3, 3] of a run, x right, y ahead along the walls, z up; how up was found, in words; and
     whether level surfaces or an accelerometer confirm it.
 
