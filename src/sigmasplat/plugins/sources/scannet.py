@@ -58,8 +58,8 @@ def _files(folder: Path) -> api.FrameFiles:
     }
 
 
-PREPROCESSED = api.published("ScanNet's depth camera", api.Camera(*DEPTH_SIZE, 577.590698, 578.729797, 318.905426, 242.683609),
-                         api.MM_PER_METRE)  # fmt: skip
+DEPTH_CAMERA = api.Camera(*DEPTH_SIZE, 577.590698, 578.729797, 318.905426, 242.683609)
+PREPROCESSED = api.published("ScanNet's depth camera", DEPTH_CAMERA, api.MM_PER_METRE)
 
 
 def open_preprocessed(path: str, settings: InputConfig) -> RecordedSource:
