@@ -1,9 +1,11 @@
 """Define the operations that the GPU benchmark times, each as the product runs it, and time them on a device."""
 
 import importlib.util
+import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,16 +16,13 @@ from works import RENDER, Timing
 
 from sigmasplat.config import TrackingConfig
 from sigmasplat.config.find_preset import default_preset, preset
-from sigmasplat.config.text import override
 from sigmasplat.errors import BackendError
 from sigmasplat.fit.field import fit_field
-from sigmasplat.fit.pose import fit_pose_adam
+from sigmasplat.fit.pose import fit_pose_adam, fit_pose_align
+from sigmasplat.fit.references import keyframe_reference, live_image
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.view import CudaView
-from sigmasplat.plugins.evaluation.metrics.trajectory import ate
-from sigmasplat.plugins.sources import SyntheticRoom
-from sigmasplat.system.slam import Slam
 
 FRAME = 100
 WARMUPS, ITERATIONS, TRACKING_ITERATIONS = 3, 10, 60
@@ -38,15 +37,25 @@ def refuse_without_device() -> None:
 
 
 def describe_device() -> dict[str, Any]:
-    """Return the device's name, capability, memory, and torch's version."""
+    """Return the device's name, capability, memory and driver, and torch's version."""
     about = torch.cuda.get_device_properties(0)
     memory_gib = round(about.total_memory / 2**30, 1)
     return {
         "name": about.name,
         "capability": [about.major, about.minor],
         "memory_gib": memory_gib,
+        "driver": _driver(),
         "torch": torch.__version__,
     }
+
+
+def _driver() -> str | None:
+    """Return the version of NVIDIA's driver; None if nvidia-smi does not say it."""
+    query = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader", "--id=0"]
+    try:
+        return subprocess.run(query, capture_output=True, text=True, timeout=20, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
 
 
 def timed(work: Callable[[], object], runs: int, device: torch.device) -> Timing:
@@ -86,8 +95,14 @@ class GpuWorks:
         for view in (self.all, self.color_depth):
             for plane in (view.g_sums, view.g_alpha, view.g_moment):
                 plane.fill_(1e-3)
-        self.mapping = preset(default_preset()).mapping
+        chosen = preset(default_preset())
+        self.mapping, self.aligning = chosen.mapping, chosen.tracking
         self.tracking = TrackingConfig(method="adam")
+        image, self.live = (
+            live_image(self.all, frame.color, frame.depth_m, target)
+            for frame, target in ((scene.frame, self.target), (scene.later, self.later))
+        )
+        self.keyframe = keyframe_reference(self.params, self.all, image, np.eye(4), self.aligning)
 
     def forward_all(self) -> None:
         """Render all: colour, depth, σ² + c², moment about the sensor's depth, alpha, median and dominant splat."""
@@ -112,6 +127,10 @@ class GpuWorks:
         self.forward_color_depth()
         self.color_depth.backward_pose(self.params)
 
+    def align(self) -> None:
+        """Track the later frame by Gauss–Newton on the keyframe's image, as the default preset does."""
+        fit_pose_align(self.keyframe, self.live, np.eye(4), self.aligning)
+
     def mapping_iterations(self) -> None:
         """Fit the field to one keyframe for `ITERATIONS`."""
         fit_field(self.field, self.all, [[Keyframe(0, self.target, np.eye(4))]] * ITERATIONS, self.mapping)
@@ -126,8 +145,13 @@ class GpuWorks:
         fit_pose_adam(self.params, self.all, self.later, np.eye(4), launched, TRACKING_ITERATIONS)
 
 
-SINGLE = ("forward_all", "forward_color_depth", "both_all", "both_color_depth", "both_pose")
+SINGLE = ("forward_all", "forward_color_depth", "both_all", "both_color_depth", "both_pose", "align")
 MANY = ("tracking_iterations", "launched_tracking_iterations", "mapping_iterations")
+
+
+def steps_of(name: str) -> int:
+    """Return how many iterations an operation takes."""
+    return 1 if name in SINGLE else ITERATIONS if name == "mapping_iterations" else TRACKING_ITERATIONS
 
 
 def measure(width: int, height: int, splats: int, runs: int, seed: int, with_peer: bool = True) -> dict[str, Any]:
@@ -148,14 +172,14 @@ def time_works(works: GpuWorks, runs: int) -> dict[str, dict[str, float]]:
     """Time every operation; for fits, one iteration."""
     found = {name: timed(getattr(works, name), runs, works.device).plain() for name in SINGLE}
     for name in MANY:
-        taken = timed(getattr(works, name), max(runs // ITERATIONS, 1), works.device)
-        steps = ITERATIONS if name == "mapping_iterations" else TRACKING_ITERATIONS
+        taken, steps = timed(getattr(works, name), max(runs // ITERATIONS, 1), works.device), steps_of(name)
         found[name[:-1]] = Timing(taken.median_ms / steps, taken.min_ms / steps, taken.runs).plain()
     return found
 
 
 def time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any] | None:
-    """Time gsplat's colour and depth on the same splats and camera; None if it is not installed or does not run."""
+    """Time gsplat's colour and depth on the same splats and camera, packed or not, whichever is faster; None if it is
+    not installed or does not run."""
     if importlib.util.find_spec("gsplat") is None:
         return None
     try:
@@ -173,38 +197,29 @@ def _time_gsplat(scene: Scene, runs: int, device: torch.device) -> dict[str, Any
     K = torch.tensor([[[c.fx, 0.0, c.cx + 0.5], [0.0, c.fy, c.cy + 0.5], [0.0, 0.0, 1.0]]], device=device)
     at = torch.eye(4, device=device)[None]
 
-    def forward() -> tuple[Tensor, Tensor]:
+    def forward(packed: bool) -> tuple[Tensor, Tensor]:
         image, alpha, _ = gsplat.rasterization(
-            *leaves, at, K, c.width, c.height, near_plane=RENDER.near_m, eps2d=RENDER.low_pass_px2, render_mode="RGB+D"
+            *leaves, at, K, c.width, c.height, near_plane=RENDER.near_m, eps2d=RENDER.low_pass_px2,
+            render_mode="RGB+D", packed=packed,
         )  # fmt: skip
         return image, alpha
 
-    def both() -> None:
-        image, alpha = forward()
+    def both(packed: bool) -> None:
+        image, alpha = forward(packed)
         torch.autograd.grad(1e-3 * (image.sum() + alpha.sum()), leaves)
 
+    def fastest(work: Callable[[bool], object]) -> dict[str, Any]:
+        """Time the packed and the unpacked form, and return the faster one."""
+        times = [timed(partial(work, packed), runs, device).plain() | {"packed": packed} for packed in (True, False)]
+        return min(times, key=lambda time: float(time["median_ms"]))
+
     with torch.no_grad():
-        forward_ms = timed(forward, runs, device).plain()
-        image = forward()[0][0, ..., :3]
+        forward_ms = fastest(forward)
+        image = forward(True)[0][0, ..., :3]
     ours = CudaView(c, RENDER, False, device)
     ours.forward(f.params, np.eye(4))
     difference = float((ours.sums[:3].movedim(0, -1) - image).abs().mean())
     return {
-        "version": gsplat.__version__, "forward": forward_ms, "both": timed(both, runs, device).plain(),
+        "version": gsplat.__version__, "forward": forward_ms, "both": fastest(both),
         "mean_color_difference": difference,
     }  # fmt: skip
-
-
-def time_slam(frames: int, seed: int) -> dict[str, Any]:
-    """Run SLAM on the built-in room at 640×480 with the default preset on CUDA; return frames/s, ATE, memory."""
-    room = SyntheticRoom(frames=200, width=640, height=480)
-    frames, device = min(frames, len(room)), torch.device("cuda", torch.cuda.current_device())
-    torch.cuda.reset_peak_memory_stats(device)
-    slam = Slam(override(preset(default_preset()), {"backend": "cuda", "seed": str(seed), "input.width": "640"}))
-    start = time.perf_counter()
-    for index in range(frames):
-        slam.step(room.frame(index))
-    seconds = time.perf_counter() - start
-    error = ate(slam.trajectory(), room.truth())
-    peak_mib = round(torch.cuda.max_memory_allocated(device) / 2**20, 1)
-    return {"frames": frames, "frames_per_s": frames / seconds, "ate_m": float(error.rmse_m), "peak_mib": peak_mib}

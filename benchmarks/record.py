@@ -40,10 +40,14 @@ def machine_slug(described: dict[str, Any]) -> str:
 
 
 def commit() -> dict[str, Any]:
-    """Return the commit of the checkout and whether the code differs from it; both None outside git."""
+    """Return the commit of the checkout and whether the code differs from it.
+
+    Outside git: that of $FLIGHT_COMMIT (benchmarks/flight.sh), with a + behind it if the code differs; else both None.
+    """
     head = _git("rev-parse", "--verify", "HEAD")
     if head is None:
-        return {"commit": None, "dirty": None}
+        given = os.environ.get("FLIGHT_COMMIT")
+        return {"commit": given.rstrip("+"), "dirty": given.endswith("+")} if given else {"commit": None, "dirty": None}
     return {"commit": head, "dirty": bool(_git("status", "--porcelain", "--untracked-files=no", "--", *MEASURED))}
 
 

@@ -5,6 +5,8 @@ Tables that no page shows stay in the JSON: those of single seeds and variants, 
 
 from dataclasses import dataclass
 
+import record
+
 
 @dataclass(frozen=True)
 class Shown:
@@ -224,6 +226,15 @@ PAGES = {
     ),
 }  # fmt: skip
 """Pages by file name: docs/results/NAME.md."""
+
+ON_A_GPU = (
+    Shown("gpu", "Times of the CUDA backend, beside gsplat."),
+    Shown("gpu-profile", "What one iteration asks of the device.", ("Iterations",)),
+    *(Shown(f"gpu-{name}", "A run on CUDA.") for name in ("sigma", "varsplat-tum", "cgslam-tum")),
+)
+"""Results of flight.sh: on a page of their own as soon as there are any."""
+if _flown := tuple(shown for shown in ON_A_GPU if record.latest(shown.name) is not None):
+    PAGES["gpu"] = Page("On a GPU", _flown)
 
 
 def anchor(name: str) -> str:

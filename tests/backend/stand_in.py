@@ -40,6 +40,8 @@ WAITING = {
     "unique_consecutive", "_linalg_check_errors",
 }  # fmt: skip
 """Operators whose result, or its size, the host needs."""
+ALLOCATING = {"empty", "empty_strided", "new_empty", "empty_like", "detach", "alias", "is_pinned", "_pin_memory"}
+"""Operators that launch no kernel."""
 PACKAGE = str(Path(sigmasplat.__file__).parent)
 RUBBISH = 99
 """What integers hold that nobody wrote; other numbers are NaN."""
@@ -85,18 +87,21 @@ class DeviceTensor(Tensor):
 
 @dataclass(frozen=True)
 class Copy:
-    """So many numbers sent between host and device, and for whom."""
+    """So many numbers sent between host and device, for whom, and whether the host waited (pageable memory)."""
 
     to_device: bool
     numbers: int
     by: str
+    waited: bool = True
 
 
 @dataclass(eq=False)
 class StandIn(TorchDispatchMode):
-    """The device while it is there: `waits` says who made the host wait and by what, `copies` what travelled."""
+    """The device while it is there: `waits` says who made the host wait and by what, `copies` what travelled,
+    `launches` the kernels that were launched, ours by name and torch's by operator."""
 
     emulator: Emulator
+    launches: list[str] = field(default_factory=list)
     waits: list[tuple[str, str]] = field(default_factory=list)
     copies: list[Copy] = field(default_factory=list)
     _on_the_way: list[tuple[Tensor, Tensor, bool]] = field(default_factory=list)
@@ -108,6 +113,7 @@ class StandIn(TorchDispatchMode):
         """Count from zero."""
         self.waits.clear()
         self.copies.clear()
+        self.launches.clear()
 
     def waited_in(self) -> list[str]:
         """Return who made the host wait, as file names in order."""
@@ -133,6 +139,8 @@ class StandIn(TorchDispatchMode):
             self._travelled(wanted, args[0].numel(), bool(kwargs.get("non_blocking")) and _is_pinned(args[0]))
         if name == "is_pinned":
             return _is_pinned(args[0])
+        if wanted and _computes(function, name):
+            self.launches.append(f"torch.{name}")
         return self._run(function, name, args, kwargs, wanted)
 
     def _run(self, function: Any, name: str, args: Any, kwargs: dict[str, Any], wanted: bool) -> Any:
@@ -194,7 +202,7 @@ class StandIn(TorchDispatchMode):
         self._arrive()
 
     def _travelled(self, to_device: bool, numbers: int, unwaited: bool = False) -> None:
-        self.copies.append(Copy(to_device, numbers, _who()))
+        self.copies.append(Copy(to_device, numbers, _who(), not unwaited))
         if not unwaited:
             self._wait("sending" if to_device else "fetching")
 
@@ -228,6 +236,7 @@ class StandIn(TorchDispatchMode):
         """Launch an emulated kernel. Its tensors must lie on the device: it could not read others."""
         given = [x for x in tree_leaves(arguments) if isinstance(x, Tensor)]
         assert all(isinstance(x, DeviceTensor) for x in given), f"{kernel} is handed memory of the host"
+        self.launches.append(kernel)
         self.emulator(features, kernel, blocks, *tree_map_only(DeviceTensor, lambda x: x.memory, arguments))
 
     def event(self, **_: Any) -> SimpleNamespace:
@@ -258,6 +267,13 @@ def _written(function: Any, args: Any) -> list[Tensor]:
     return [x for a, x in named if a.alias_info is not None and a.alias_info.is_write]
 
 
+def _computes(function: Any, name: str) -> bool:
+    """Return whether an operator launches at least one kernel: it neither makes a view nor only allocates memory."""
+    returns = function._schema.returns
+    view = bool(returns) and returns[0].alias_info is not None and not returns[0].alias_info.is_write
+    return not view and name not in ALLOCATING
+
+
 def _spoil(tensor: Tensor) -> None:
     """Fill memory with what nobody wrote."""
     tensor.fill_(torch.nan if tensor.dtype.is_floating_point else True if tensor.dtype == torch.bool else RUBBISH)
@@ -272,7 +288,8 @@ def _who() -> str:
 
 
 def library_in(folder: Path) -> Any:
-    """Compile what lets a torch built without CUDA speak of a CUDA device (emulation/device.cpp), and load it.
+    """Compile what lets a torch built without CUDA speak of a CUDA device (emulation/device.cpp), unless the folder has
+    it, and load it.
 
     To be called before anything is differentiated: autograd starts a thread for each kind of device at first use.
     """
@@ -280,8 +297,9 @@ def library_in(folder: Path) -> Any:
     libraries = [f"-L{torch_folder / 'lib'}", "-lc10", "-ltorch_cpu", f"-Wl,-rpath,{torch_folder / 'lib'}"]
     flags = [*FLAGS, f"-isystem{torch_folder / 'include'}"]
     line = [os.environ.get("CXX") or "g++", *flags, str(HERE / "device.cpp"), "-o", str(made), *libraries]
-    done = subprocess.run(line, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    if not made.exists():
+        done = subprocess.run(line, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
     return ctypes.CDLL(str(made))
 
 

@@ -17,9 +17,10 @@ pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))
-gpu, gpu_works, record, scenes, tables = map(
-    importlib.import_module, ("gpu", "gpu_works", "record", "scenes", "tables")
+gpu, gpu_profile, gpu_slam, gpu_works, record, scenes = map(
+    importlib.import_module, ("gpu", "gpu_profile", "gpu_slam", "gpu_works", "record", "scenes")
 )
+DEVICE = {"name": "GPU", "torch": "2", "driver": None}
 
 
 @pytest.fixture
@@ -41,37 +42,61 @@ def test_every_piece_of_work_runs(works: Any, monkeypatch: pytest.MonkeyPatch) -
 
 
 def figures(tracking_ms: float, peer: bool) -> dict[str, Any]:
-    works = {work: {"median_ms": 1.0} for _, work in gpu.COLUMNS} | {"both_all": {"median_ms": 1.2}}
+    works = {work: {"median_ms": 0.3} for _, work in gpu.COLUMNS} | {"both_all": {"median_ms": 1.2}}
     works["tracking_iteration"] = {"median_ms": tracking_ms}
-    times = {"forward": {"median_ms": 0.5}, "both": {"median_ms": 3.0}, "mean_color_difference": 1e-4}
-    scene = {"splats": 300_000, "width": 1200, "height": 680, "peak_mib": 9.0, "gsplat": times if peer else None}
-    slam = {"frames_per_s": 31.0}
-    return {"device": {"name": "GPU", "torch": "2"}, "scenes": [scene | {"works": works}], "slam": slam}
+    times = {"forward": {"median_ms": 0.5}, "both": {"median_ms": 0.48}, "mean_color_difference": 1e-4}
+    scene = {"splats": 77_000, "width": 640, "height": 480, "peak_mib": 9.0, "gsplat": times if peer else None}
+    return {"device": DEVICE, "scenes": [scene | {"works": works}, scene | {"works": works, "width": 1200}]}
 
 
 def test_goals_are_judged() -> None:
-    made = gpu.sections({"figures": figures(2.5, peer=True)})
+    made = gpu.sections({"figures": figures(0.2, peer=True)})
     assert [section.title for section in made] == ["Times, ms", "Beside gsplat, colour and depth, ms", "Goals"]
-    assert [row[3] for row in made[-1].rows] == ["**no**", "**no**", "yes", "yes", "yes"]
+    assert [row[3] for row in made[-1].rows] == ["yes", "**no**", "yes", "yes"]
+    assert made[-1].rows[1][:3] == ["tracking iteration, ms, 77 k, 640×480", "≤ 0.100", "0.200"]
     assert all(len(row) == len(section.columns) for section in made for row in section.rows)
-    alone = gpu.sections({"figures": figures(1.0, peer=False)})
-    assert [row[3] for row in alone[-1].rows] == ["**no**", "yes", "yes", "yes"] and len(alone) == 2
+    alone = gpu.sections({"figures": figures(0.05, peer=False)})
+    assert [row[3] for row in alone[-1].rows] == ["yes"] * 3 and len(alone) == 2
+
+
+def test_runs_of_presets_are_judged() -> None:
+    run = {
+        "recording": "room", "frames": 60, "first_s": 1.0, "frames_per_s": 90.0, "median_ms": 11.0, "longest_ms": 30.0,
+        "lost": 0, "splats": 77_000, "peak_mib": 900.0, "ate_m": 0.01, "apart_m": 5e-4,
+    }  # fmt: skip
+    rest = {"ate_m": None, "apart_m": None, "frames_per_s": None}
+    measured = {"figures": {"device": DEVICE, "runs": [run, run | rest]}, "config": {"preset": "sigma"}}
+    runs, goals = gpu_slam.sections(measured)
+    assert all(len(row) == len(runs.columns) for row in runs.rows) and runs.rows[1][6] == "–"
+    assert [row[1:] for row in goals.rows] == [["≥ 100", "90.0", "**no**"], ["≤ 0.00100", "0.000500", "yes"]]
+
+
+def test_a_profile_is_laid_out() -> None:
+    kernels = [{"kernel": "blend", "runs": 1.0, "us": 40.0}]
+    work = {"work": "align", "wall_ms": 1.0, "busy_ms": 0.5, "launches": 9.0, "copies": 1.0, "waits": 1.0}
+    given = {"device": DEVICE, "works": [work | {"kernels": kernels}]}
+    made = gpu_profile.sections({"figures": given, "config": {"splats": 77_000, "size": [640, 480]}})
+    assert made[0].rows == [["align", "1.00", "0.500", "9.00", "1.00", "1.00"]]
+    assert made[1].title == "align" and made[1].rows == [["blend", "1.00", "40.0"]]
 
 
 def test_what_was_measured_is_kept_when_the_rest_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: Any) -> None:
-        raise BackendError("the device is gone")
-
     asked, made = list[Any](), figures(1.0, peer=False)
+
+    def measured(*given: Any) -> Any:
+        if len(asked) == 3:
+            raise BackendError("the device is gone")
+        asked.append(given)
+        return made["scenes"][0]
+
     monkeypatch.setattr(gpu_works, "refuse_without_device", lambda: None)
     monkeypatch.setattr(gpu_works, "describe_device", lambda: made["device"])
-    monkeypatch.setattr(gpu_works, "measure", lambda *given: asked.append(given) or made["scenes"][0])
-    monkeypatch.setattr(gpu_works, "time_slam", fail)
+    monkeypatch.setattr(gpu_works, "measure", measured)
     assert gpu.main(gpu.Options(splats=(2000, 1000), out=tmp_path, alone=True)) == 2
-    assert [given[:3] for given in asked] == [(*size, n) for size in gpu.SIZES for n in (1000, 2000)]
+    assert [given[:3] for given in asked] == [(*size, n) for size in gpu.SIZES for n in (1000, 2000)][:3]
     assert not any(given[-1] for given in asked), "gsplat was to be left out"
     (kept,) = tmp_path.iterdir()
-    assert len(record.read(kept)["figures"]["scenes"]) == 4
+    assert len(record.read(kept)["figures"]["scenes"]) == 3
 
 
 def test_a_peer_that_does_not_run_is_left_out(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
