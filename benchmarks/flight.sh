@@ -190,7 +190,7 @@ run_ncu() {
 # of these tests records one.
 TESTS=tests/backend/test_cuda_device.py ALIGN=tests/backend/test_cuda_align_device.py
 SIX=(
-  "$TESTS::test_planes_rows_and_twist_agree[random-K7]" "$TESTS::test_a_step_is_taken"
+  "$TESTS::test_planes_rows_and_twist_agree[random-K7-ray]" "$TESTS::test_a_step_is_taken"
   "$TESTS::test_fits_are_those_of_the_cpu[1-3]" "$TESTS::test_the_tracking_loss_is_as_defined[kept]"
   "$ALIGN::test_normal_equations_are_the_cpus_and_those_of_the_residuals[huber-holes]"
   "$ALIGN::test_two_images_are_aligned_as_on_the_cpu[True-(161, 119)]"

@@ -135,7 +135,8 @@ def _merged(rows: Rows) -> Rows:
 
 
 def _cells(row: dict[str, Any]) -> list[str]:
-    counts = ", ".join(str(count) for count in row["counts"] if count > 0)
+    fits = (cubins.FITTING, cubins.ALIGNING)
+    counts = ", ".join(f"{-n} ray" if n < 0 else f"{n}" for n in row["counts"] if n not in fits)
     return [row["kernel"], counts or "–", *(str(row[name]) for name in ("registers", "spilled", "shared", "blocks"))]
 
 

@@ -102,15 +102,13 @@ class Backend:
     """A device that renders and fits; `backend` and SIGMASPLAT_BACKEND name it.
 
     operators(): the module with its `project` and `blend`; view(camera, options, variance): a view (`render/view.py`);
-    fits(): what it offers to the fits; options(options): those that it renders with, if it has not all of them;
-    device(): the device that holds its tensors, None = host memory.
+    fits(): what it offers to the fits; device(): the device that holds its tensors, None = host memory.
     """
 
     name: str
     operators: "Callable[[], ModuleType]"
     view: "Callable[[Camera, RenderConfig, bool], View]"
     fits: "Callable[[], DeviceFits]"
-    options: "Callable[[RenderConfig], RenderConfig] | None" = None
     device: "Callable[[], torch.device] | None" = None
 
 

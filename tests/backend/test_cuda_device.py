@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from constants import changed
-from paper_settings import MappingConfig, TrackingConfig
+from paper_settings import MappingConfig, RenderConfig, TrackingConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
@@ -37,17 +37,23 @@ REASON = cuda_launch.missing()
 pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 
 
-def on_device(params: Tensor, camera: Camera, T: np.ndarray, variance: bool = True) -> list[Tensor]:
-    return [x.cpu() for x in there_and_back(CudaView(camera, OPTIONS, variance), params.cuda(), T)]
+RAY = RenderConfig(depth="ray")
 
 
+def on_device(
+    params: Tensor, camera: Camera, T: np.ndarray, variance: bool = True, options: Any = OPTIONS
+) -> list[Tensor]:
+    return [x.cpu() for x in there_and_back(CudaView(camera, options, variance), params.cuda(), T)]
+
+
+@pytest.mark.parametrize("options", [OPTIONS, RAY], ids=["center", "ray"])
 @pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_planes_rows_and_twist_agree(kind: str, variance: bool) -> None:
+def test_planes_rows_and_twist_agree(kind: str, variance: bool, options: RenderConfig) -> None:
     s = scene(kind, 60)
     params, T = params_of(s), s.T_camera_world.numpy()
-    maps, rows, twist = on_device(params, s.camera, T, variance)
-    want_maps, want_rows, want_twist = there_and_back(exact_view(s.camera, variance), params.double(), T)
+    maps, rows, twist = on_device(params, s.camera, T, variance, options)
+    want_maps, want_rows, want_twist = there_and_back(exact_view(s.camera, variance, options), params.double(), T)
     assert float((maps - want_maps).norm()) < 2e-5 * float(want_maps.norm())
     for name, columns in COLUMNS.items():
         if variance or name != "log_variances":

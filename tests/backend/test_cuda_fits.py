@@ -77,7 +77,6 @@ def test_a_pose_is_found_as_on_the_cpu() -> None:
 def settings(**changes: str) -> Config:
     small = {"input.width": "48", "mapping.first_iterations": "5", "mapping.iterations": "2", "mapping.every": "2"}
     small |= {"final.iterations": "0", "seeding.first_uniform": "200", "seeding.first_gradient": "200"}
-    small["render.depth"] = "center"  # a device has no other
     return override(
         preset(default_preset()), small | {name.replace("__", "."): value for name, value in changes.items()}
     )

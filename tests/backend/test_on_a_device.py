@@ -174,7 +174,7 @@ QUICK = {
     "input.width": "48", "mapping.first_iterations": "5", "mapping.iterations": "2", "mapping.every": "2",
     "seeding.first_uniform": "200", "seeding.first_gradient": "200", "submaps.frames": "3", "loops.min_interval": "1",
     "loops.min_similarity": "0.0", "registration.iterations": "2",
-    "final.iterations": "3", "render.depth": "center",  # a device has no other
+    "final.iterations": "3",
 }  # fmt: skip
 RUNS = {
     "sigma": {},

@@ -10,14 +10,12 @@ from torch import Tensor
 from paper_settings import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.errors import BackendError
-from sigmasplat.plugins.cuda.view import CudaView
 from sigmasplat.render import reference, render
-from sigmasplat.render.backend import options_on
+from sigmasplat.render.backend import make_view
 from sigmasplat.render.cpu import CpuView
 from sigmasplat.uncertainty.predictive import blend_values
-from splat_fields import CPU, crowd, exact_view, params_of, plane_gradients
-from splat_scenes import KINDS, WIDE, Scene, assert_same_vector, scene
+from splat_fields import crowd, exact_view, params_of, plane_gradients
+from splat_scenes import KINDS, Scene, assert_same_vector, scene
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -47,10 +45,10 @@ def carried(view: Any, params: Tensor, s: Scene, maps: bool) -> dict[str, Tensor
 @pytest.mark.parametrize("maps", [False, True], ids=["sums", "all maps"])
 @pytest.mark.parametrize("variance", [False, True], ids=["K4", "K7"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, maps: bool) -> None:
+def test_planes_and_gradients_follow_the_definition(kind: str, variance: bool, maps: bool, kernels: str) -> None:
     s = scene(kind, 60)
     params = params_of(s)
-    got = carried(CpuView(s.camera, RAY, variance), params, s, maps)
+    got = carried(make_view(kernels, s.camera, RAY, variance), params, s, maps)
     want = carried(exact_view(s.camera, variance, RAY), params.double(), s, maps)
     for name, value in want.items():
         assert_same_vector(got[name], value, 1e-3 if name == "planes" else 2e-4, name)
@@ -90,24 +88,16 @@ def test_slopes_are_those_of_the_densest_point_along_the_ray() -> None:
         assert linear == pytest.approx(densest, abs=0.1 * abs(densest - 2.0)) and abs(densest - 2.0) > 5e-3
 
 
-def test_a_render_and_a_view_have_the_same_depth() -> None:
+def test_a_render_and_a_view_have_the_same_depth(kernels: str) -> None:
     s = scene("random", 60)
-    field, view, T = GaussianField(params_of(s)), CpuView(s.camera, RAY), s.T_camera_world.numpy()
+    field, view, T = GaussianField(params_of(s)), make_view(kernels, s.camera, RAY), s.T_camera_world.numpy()
     view.forward(field.params, T, layers=True)
     crop = slice(s.camera.height), slice(s.camera.width)
-    seen, center = render(field, s.camera, T, None, RAY), render(field, s.camera, T)
+    seen, center = (render(field, s.camera, T, None, options, kernels) for options in (RAY, None))
     assert_same_vector(seen.depth, view.sums[3][crop], 1e-5, "depth")
     assert_same_vector(seen.median_depth, view.layers.median_depth[crop], 1e-5, "median depth")
-    blended = blend_values(field, s.camera, T, torch.zeros(60, 0), RAY, "cpu")
+    blended = blend_values(field, s.camera, T, torch.zeros(60, 0), RAY, kernels)
     assert_same_vector(blended.depth, seen.depth, 1e-5, "depth beside values")
     assert float((seen.depth - center.depth).abs().max()) > 1e-2
     assert torch.equal(seen.alpha, center.alpha) and torch.equal(seen.color, center.color)
-    assert render(GaussianField.empty(), s.camera, T, None, RAY).depth.shape == seen.depth.shape
-
-
-def test_what_has_no_depth_along_the_ray_refuses_it() -> None:
-    with pytest.raises(BackendError, match=r"render\.depth=center"):
-        CudaView(WIDE, RAY, True, CPU)
-    with pytest.warns(UserWarning, match="CUDA"):
-        assert options_on("cuda", RAY) == RenderConfig()
-    assert options_on("cpu", RAY) is RAY
+    assert render(GaussianField.empty(), s.camera, T, None, RAY, kernels).depth.shape == seen.depth.shape

@@ -23,7 +23,7 @@ class RenderConfig(Section, name="render"):
     surfaces."""
     depth: Literal["center", "ray"] = "ray"
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
-    that a flat splat can show a slanted surface (RaDe-GS). On CUDA it is center, with a warning."""
+    that a flat splat can show a slanted surface (RaDe-GS)."""
     scene_scale: Above0 = 1.0
     """Size of the scene relative to a room. Fixed limits in metres, such as the gates of alignment, are multiplied by
     it. `run` sets it for stereo recordings, together with all settings that are lengths (`config.scale.scaled`)."""

@@ -60,12 +60,6 @@ def backend_module(asked: str, device: torch.device | None = None) -> ModuleType
     return reference if name == "reference" else cpu
 
 
-def options_on(backend: str, options: RenderConfig) -> RenderConfig:
-    """Return the options that a backend (by name) renders with; a device that has not all of them warns."""
-    row = backend_row(backend)
-    return options if row is None or row.options is None else row.options(options)
-
-
 def make_view(backend: str, camera: Camera, options: RenderConfig, variance: bool = True) -> View:
     """Make a view on a backend by name, or "auto". Raises BackendError as `backend_module` does."""
     name = backend_name(backend)

@@ -12,7 +12,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.harmonics import view_colors
-from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
+from sigmasplat.render.backend import backend_module, on_device
 from sigmasplat.render.kernels import depth_at, depth_of, features_of, plane_features, variance_of
 from sigmasplat.render.reference import depth_slopes
 
@@ -63,8 +63,7 @@ def render(
     The pose gradient is the sum of the paths through 2D means, 2D covariances (unless `options` leaves them out),
     depths, and the viewing directions of `harmonics`. Raises BackendError if the backend is not available.
     """
-    kernels, name = backend_module(backend, field.params.device), backend_name(backend, field.params.device)
-    options = options_on(name, options or CENTER)
+    kernels, options = backend_module(backend, field.params.device), options or CENTER
     field = on_device(field, backend)
     T = torch.as_tensor(T_camera_world)
     p = kernels.project(field.means, field.quats, field.scales, T, camera, options)

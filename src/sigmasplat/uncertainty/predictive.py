@@ -21,7 +21,7 @@ from sigmasplat.config import RenderConfig
 from sigmasplat.data import se3
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import COLUMNS, GaussianField
-from sigmasplat.render.backend import backend_module, backend_name, on_device, options_on
+from sigmasplat.render.backend import backend_module, on_device
 from sigmasplat.render.kernels import Projection, depth_of, plane_features
 from sigmasplat.render.render import CENTER, colors_from
 from sigmasplat.uncertainty.map_uncertainty import (
@@ -93,8 +93,6 @@ def blend_values(
     Raises BackendError if the backend is not available.
     """
     kernels, T = backend_module(backend, field.params.device), torch.as_tensor(T_camera_map)
-    name = backend_name(backend, field.params.device)
-    options = options_on(name, options)
     with torch.no_grad():
         scales = field.params[:, COLUMNS["log_scales"]].contiguous().exp()  # contiguous: much faster
         whole = kernels.project(field.means, field.quats, scales, T, camera, options)

@@ -1,7 +1,7 @@
 // The kernels of a program as a library that tests call by name.
 #include "emulation.h"
 
-#if FEATURES > 0
+#if FEATURES > 0 || FEATURES < -1   // with depth along the ray they are negative
 #include "raster.cu"
 #elif FEATURES == -1
 #include "align.cu"

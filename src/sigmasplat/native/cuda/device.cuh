@@ -1,6 +1,6 @@
 // The functions that splat.h needs from its number type, for one float of a GPU thread, and the layouts shared by the
 // CUDA kernels. There is one program per feature count: FEATURES is defined on compilation (plugins/cuda/cubins.py lists
-// the counts).
+// the counts). A negative one is that of views whose depth is along the ray.
 #pragma once
 #include "sums.cuh"
 
@@ -24,10 +24,13 @@ constexpr float LOG2_E = 1.4426950408889634f;
 // alpha = 2^(log2(o) − p² − q²), p = L1·dx + L2·dy, q = L3·dy, L = CONIC_SCALE·l.
 constexpr float CONIC_SCALE = 0.8493218002880191f;    // sqrt(log2(e)/2)
 
-// A splat as used per pixel: 8 floats of geometry, then its features, padded to whole float4s.
-struct Geometry { float l1, l2, l3, u, v, log_opacity, z, spare; };
+// A splat as used per pixel: 8 floats of geometry, then its features, padded to whole float4s. With RAYS its depth at a
+// pixel is z + slope_u·(x − u) + slope_v·(y − v), and feature DEPTH holds slope_v; else it is z, which that feature holds too.
+struct Geometry { float l1, l2, l3, u, v, log_opacity, z, slope_u; };
+constexpr bool RAYS = FEATURES < 0;
+constexpr int COUNT = RAYS ? -FEATURES : FEATURES, DEPTH = 3;
 constexpr int GEOMETRY = 8;
-constexpr int SLOTS = (FEATURES + 3) / 4 * 4;         // floats of features in a row
+constexpr int SLOTS = (COUNT + 3) / 4 * 4;            // floats of features in a row
 constexpr int ROW = GEOMETRY + SLOTS;
 constexpr int PARAMS = 17;                            // columns of GaussianField.params
 

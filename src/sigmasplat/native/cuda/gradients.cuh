@@ -6,8 +6,12 @@
 namespace sigmasplat {
 
 // A record: Σ g·{1, x, y, xx, xy, yy}, then Σ w·∂L/∂feature; with a moment Σ w·2·∂L/∂moment and its product with −ref.
-constexpr int MOMENTS = 6;
-template <int COLORS, bool MOMENT> constexpr int sums_in = MOMENTS + COLORS + (MOMENT ? 2 : 0);
+// With RAYS, after the features, Σ w·∂L/∂depth·{x, y}; and in a second part, of HALF_WARP sums, those of the moment times
+// {1, x, y, xx, xy, yy} and {1, x, y}.
+constexpr int MOMENTS = 6, HALF_WARP = 16;
+template <int COLORS> constexpr int moment_at = RAYS ? HALF_WARP : MOMENTS + COLORS;
+template <int COLORS, bool MOMENT> constexpr int sums_in =
+    MOMENT ? moment_at<COLORS> + (RAYS ? 9 : 2) : MOMENTS + COLORS + (RAYS ? 2 : 0);
 template <int COLORS, bool MOMENT> constexpr int record_floats = (sums_in<COLORS, MOMENT> + 3) / 4 * 4;
 
 struct PlaneGradients { const float *sums, *moment, *alpha; };   // alpha may be null
@@ -49,9 +53,18 @@ template <int COLORS, bool MOMENT> inline void store_basis(const Walk<COLORS, MO
     const float moments[MOMENTS] = {1.f, x, y, x * x, x * y, y * y};
     for (int c = 0; c < MOMENTS; c++) at[c * PIXELS] = moments[c];
     for (int c = 0; c < COLORS; c++) at[(MOMENTS + c) * PIXELS] = walk.on_sums[c];
-    if (MOMENT) {
-        at[(MOMENTS + COLORS) * PIXELS] = 2.f * walk.on_moment;
-        at[(MOMENTS + COLORS + 1) * PIXELS] = -2.f * walk.on_moment * walk.ref;
+    const float on_square = 2.f * walk.on_moment, by_ref = -on_square * walk.ref;
+    float* of_moment = at + moment_at<COLORS> * PIXELS;
+    if (RAYS) {
+        for (int c = MOMENTS + COLORS; c < HALF_WARP && c < sums_in<COLORS, MOMENT>; c++) at[c * PIXELS] = 0.f;
+        for (int c = 0; c < 2; c++) at[(MOMENTS + COLORS + c) * PIXELS] = walk.on_sums[DEPTH] * moments[1 + c];
+        if (MOMENT) {
+            for (int c = 0; c < MOMENTS; c++) of_moment[c * PIXELS] = on_square * moments[c];
+            for (int c = 0; c < 3; c++) of_moment[(MOMENTS + c) * PIXELS] = by_ref * moments[c];
+        }
+    } else if (MOMENT) {
+        of_moment[0] = on_square;
+        of_moment[PIXELS] = by_ref;
     }
 }
 
@@ -65,9 +78,10 @@ inline bool pass(Walk<COLORS, MOMENT>& walk, const float* row, float x, float y,
     const float raw = exp2f(power), alpha = fminf(raw, ALPHA_MAX);
     w = walk.light * alpha;
     float G = walk.on_alpha;
-    for (int c = 0; c < COLORS; c++) G = fmaf(walk.on_sums[c], row[GEOMETRY + c], G);
+    const float depth = depth_at(row, b, x, y);
+    for (int c = 0; c < COLORS; c++) G = fmaf(walk.on_sums[c], feature_at(row, c, depth), G);
     if (MOMENT) {
-        const float off = b.z - walk.ref;
+        const float off = depth - walk.ref;
         G = fmaf(walk.on_moment * off, off, G);
     }
     walk.behind = fmaf(-w, G, walk.behind);
@@ -77,10 +91,13 @@ inline bool pass(Walk<COLORS, MOMENT>& walk, const float* row, float x, float y,
     return true;
 }
 
-// Lane c of a warp holds sum c of one record. Move the centre of its moments from the tile's centre to the splat's
-// mean, at (u, v) relative to it.
-inline float about_mean(float sum, int c, float u, float v) {
+// Lane c of a warp holds sum c of one record, or of its second part. Move the centre of its moments from the tile's
+// centre to the splat's mean, at (u, v) relative to it. one: the lane of a sum whose products with x and y are at `of_x`
+// and the next lane, for RAYS.
+inline float about_mean(float sum, int c, float u, float v, int one, int of_x) {
+    const float whole = RAYS ? __shfl_sync(ALL_LANES, sum, one) : 0.f;
     const float m0 = __shfl_sync(ALL_LANES, sum, 0), mx = __shfl_sync(ALL_LANES, sum, 1), my = __shfl_sync(ALL_LANES, sum, 2);
+    if (RAYS && c >= of_x) return c > of_x + 1 ? sum : fmaf(c == of_x ? -u : -v, whole, sum);
     switch (c) {
         case 1: return fmaf(-u, m0, sum);
         case 2: return fmaf(-v, m0, sum);
@@ -97,8 +114,8 @@ template <int COLORS, bool MOMENT>
 inline void write_record(const float* pairs, const float* basis, const bool* live, int s, float u, float v, float* record) {
     constexpr int SUMS = sums_in<COLORS, MOMENT>, RECORD = record_floats<COLORS, MOMENT>;
     const int lane = int(threadIdx.x) % 32, half = lane / 16;
-    for (int first = 0; first < SUMS; first += 16) {
-        const int c = first + lane % 16, column = c < SUMS ? c : 0;
+    for (int first = 0; first < SUMS; first += HALF_WARP) {
+        const int c = first + lane % HALF_WARP, column = c < SUMS ? c : 0;
         const float* values = pairs + (column < MOMENTS ? 0 : WEIGHTS) + s * PIXELS + half * 16;
         const float* factors = basis + column * PIXELS + half * 16;
         float4 part = make_float4(0.f, 0.f, 0.f, 0.f);
@@ -112,7 +129,8 @@ inline void write_record(const float* pairs, const float* basis, const bool* liv
         }
         float sum = (part.x + part.y) + (part.z + part.w);
         sum += __shfl_xor_sync(ALL_LANES, sum, 16);
-        if (first == 0) sum = about_mean(sum, c, u, v);
+        if (first == 0) sum = about_mean(sum, c, u, v, MOMENTS + DEPTH, MOMENTS + COLORS);
+        else if (RAYS) sum = about_mean(sum, c - first, u, v, MOMENTS, MOMENTS + 1);
         if (half == 0 && c < RECORD) record[c] = c < SUMS ? sum : 0.f;
     }
 }
@@ -144,7 +162,7 @@ inline void blend_tile_backward(const Frame& frame, const float* rows, const Lis
             const Geometry geometry = geometry_at(rows, items[t]);
             patches[t] = patches_reached(geometry, frame, corner_x, corner_y);
             means[t] = make_float2(geometry.u - (corner_x + (TILE - 1) * 0.5f), geometry.v - (corner_y + (TILE - 1) * 0.5f));
-            store_about_center(geometry, corner_x, corner_y, batch + t * STEP);
+            store_about_center(geometry, rows + size_t(items[t]) * ROW + GEOMETRY, corner_x, corner_y, batch + t * STEP);
         }
         for (int q = t; q < size * QUADS; q += THREADS) {
             const float4* from = reinterpret_cast<const float4*>(rows + size_t(items[q / QUADS]) * ROW + GEOMETRY);
@@ -179,11 +197,11 @@ inline void blend_tile_backward(const Frame& frame, const float* rows, const Lis
 
 KERNEL blend_backward(Frame frame, const float* rows, Lists lists, const long long* slots, const float* reference, int used, Planes o,
                       PlaneGradients g, float* records) {
-    blend_tile_backward<FEATURES, false>(frame, rows, lists, slots, reference, used, o, g, records);
+    blend_tile_backward<COUNT, false>(frame, rows, lists, slots, reference, used, o, g, records);
 }
 KERNEL blend_backward_moment(Frame frame, const float* rows, Lists lists, const long long* slots, const float* reference, int used,
                              Planes o, PlaneGradients g, float* records) {
-    blend_tile_backward<FEATURES, true>(frame, rows, lists, slots, reference, used, o, g, records);
+    blend_tile_backward<COUNT, true>(frame, rows, lists, slots, reference, used, o, g, records);
 }
 
 // Sum each splat's records, which are contiguous, in order, with one thread per sum and splat. There must be fewer than
@@ -209,7 +227,7 @@ inline FootprintGradient<float> footprint_gradient(const float* m, float l1, flo
     g.l1 = -(l1 * m[3] + l2 * m[4]);
     g.l2 = -(l1 * m[4] + l2 * m[5]);
     g.l3 = -l3 * m[5];
-    g.z = 0.f;
+    g.z = g.slope_u = g.slope_v = 0.f;
     return g;
 }
 
@@ -254,17 +272,40 @@ KERNEL blend_backward_pose(Frame frame, const float* rows, Lists lists, const lo
     blend_tile_backward<4, false>(frame, rows, lists, slots, nullptr, used, o, g, records);
 }
 
-// Propagate a splat's summed record to its shape and to the pose.
-inline void chain(const View<float>& view, const Splat& s, const float* m, int moment, float on_median, FootprintGradient<float>& g,
-                  ShapeGradient<float>& out) {
-    const Footprint<float> f = project(view, s.shape, view.near_m);
-    g = footprint_gradient(m, f.l1, f.l2, f.l3);
-    g.z = m[MOMENTS + 3] + on_median;
-    if (moment) g.z += fmaf(f.z, m[moment], m[moment + 1]);
-    project_backward(view, s.shape, view.near_m, g, out);
+// Add ∂L/∂(depth at the pixels) to a splat's footprint, from the sums of a record about its mean. colors: features with
+// gradients. median: ∂L/∂(median depth), alone and times x and y; null = none.
+inline void add_depth_gradient(const Footprint<float>& f, const float* m, int colors, int moment, const float* median,
+                               FootprintGradient<float>& g) {
+    const float* q = m + moment;
+    g.z = m[MOMENTS + DEPTH];
+    if (median) g.z += median[0];
+    if (!RAYS) {
+        if (moment) g.z += fmaf(f.z, q[0], q[1]);
+        return;
+    }
+    g.slope_u = m[MOMENTS + colors] + (median ? median[1] : 0.f);
+    g.slope_v = m[MOMENTS + colors + 1] + (median ? median[2] : 0.f);
+    if (moment) {                          // 2·w·∂L/∂moment·(z + slopes·(x, y) − ref), times 1, x and y
+        g.z += fmaf(f.z, q[0], fmaf(f.slope_u, q[1], fmaf(f.slope_v, q[2], q[6])));
+        g.slope_u += fmaf(f.z, q[1], fmaf(f.slope_u, q[3], fmaf(f.slope_v, q[4], q[7])));
+        g.slope_v += fmaf(f.z, q[2], fmaf(f.slope_u, q[4], fmaf(f.slope_v, q[5], q[8])));
+    }
+    g.u = fmaf(-f.slope_u, g.z, g.u);
+    g.v = fmaf(-f.slope_v, g.z, g.v);
 }
 
-// on_median [n] or null: ∂L/∂(median depth), for one splat per pixel. pull [n] or null: |∂L/∂mean| per half image size.
+// Propagate a splat's summed record to its shape and to the pose.
+inline void chain(const View<float>& view, const Splat& s, const float* m, int colors, int moment, const float* median,
+                  FootprintGradient<float>& g, ShapeGradient<float>& out) {
+    Footprint<float> f = project(view, s.shape, view.near_m);
+    if (RAYS) add_slopes(view, s.shape, view.near_m, f);
+    g = footprint_gradient(m, f.l1, f.l2, f.l3);
+    add_depth_gradient(f, m, colors, moment, median, g);
+    project_backward<RAYS>(view, s.shape, view.near_m, g, out);
+}
+
+// on_median [n, 3], [n, 1] without RAYS, or null: ∂L/∂(median depth), for one splat per pixel, then times x − u and
+// y − v. pull [n] or null: |∂L/∂mean| per half image size.
 KERNEL chain_params(View<float> view, const float* pose, const float* params, const int* counts, const float* sums,
                     const float* on_median, int n, int record, int moment, float* on_params, float* pull, double* twists) {
     const int i = thread_number();
@@ -277,14 +318,14 @@ KERNEL chain_params(View<float> view, const float* pose, const float* params, co
             const float* m = sums + size_t(i) * record;
             FootprintGradient<float> g;
             ShapeGradient<float> out;
-            chain(view, s, m, moment, on_median ? on_median[i] : 0.f, g, out);
+            chain(view, s, m, COUNT, moment, on_median ? on_median + size_t(i) * (RAYS ? 3 : 1) : nullptr, g, out);
             for (int q = 0; q < 6; q++) twist[q] = out.twist[q];
             for (int q = 0; q < 3; q++) row[q] = out.mean[q];
             for (int q = 0; q < 4; q++) row[3 + q] = out.quat[q];
             for (int q = 0; q < 3; q++) row[7 + q] = out.scale[q] * s.shape.scale[q];
             row[10] = m[0] * (1.f - s.opacity);
             for (int q = 0; q < 3; q++) {
-                const float on_square = FEATURES > 4 ? m[MOMENTS + 4 + q] : 0.f;
+                const float on_square = COUNT > 4 ? m[MOMENTS + 4 + q] : 0.f;
                 row[11 + q] = fmaf(2.f * s.color[q], on_square, m[MOMENTS + q]);
                 row[14 + q] = on_square * s.variance[q];
             }
@@ -305,7 +346,7 @@ KERNEL chain_pose(View<float> view, const float* pose, const float* params, cons
     if (i < n && counts[i]) {
         FootprintGradient<float> g;
         ShapeGradient<float> out;
-        chain(posed(view, pose), activated(params, i), sums + size_t(i) * record, 0, 0.f, g, out);
+        chain(posed(view, pose), activated(params, i), sums + size_t(i) * record, 4, 0, nullptr, g, out);
         for (int q = 0; q < 6; q++) twist[q] = out.twist[q];
     }
     store_sums<6>(twist, twists);

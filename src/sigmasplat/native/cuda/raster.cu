@@ -37,6 +37,7 @@ KERNEL pack_given(const float* means2d, const float* conics, const float* z, con
     f.z = z[i];
     f.var_v = 1.f / (f.l3 * f.l3);
     f.var_u = (f.l2 * f.l2 * f.var_v + 1.f) / (f.l1 * f.l1);
+    f.slope_u = 0.f;
     float features[SLOTS];
     for (int c = 0; c < SLOTS; c++) features[c] = c < used ? given[size_t(i) * used + c] : 0.f;
     pack(to, i, f, opacities[i], radii[2 * size_t(i)] > 0.f, frame);
@@ -53,7 +54,7 @@ inline Splat activated(const float* params, int i) {  // GaussianField's columns
     for (int k = 0; k < 3; k++) s.shape.scale[k] = expf(s.shape.scale[k]);
     s.opacity = 1.f / (1.f + expf(-row[10]));
     for (int k = 0; k < 3; k++) s.color[k] = row[11 + k];
-    for (int k = 0; k < 3; k++) s.variance[k] = FEATURES > 4 ? expf(row[14 + k]) : 0.f;
+    for (int k = 0; k < 3; k++) s.variance[k] = COUNT > 4 ? expf(row[14 + k]) : 0.f;
     return s;
 }
 
@@ -62,9 +63,10 @@ KERNEL pack_view(View<float> view, const float* pose, const float* params, int n
     if (i >= n) return;
     view = posed(view, pose);
     const Splat s = activated(params, i);
-    const Footprint<float> f = project(view, s.shape, view.near_m);
-    float features[SLOTS] = {s.color[0], s.color[1], s.color[2], f.z};
-    for (int k = 4; k < FEATURES; k++) features[k] = fmaf(s.color[k - 4], s.color[k - 4], s.variance[k - 4]);
+    Footprint<float> f = project(view, s.shape, view.near_m);
+    if (RAYS) add_slopes(view, s.shape, view.near_m, f);
+    float features[SLOTS] = {s.color[0], s.color[1], s.color[2], RAYS ? f.slope_v : f.z};
+    for (int k = 4; k < COUNT; k++) features[k] = fmaf(s.color[k - 4], s.color[k - 4], s.variance[k - 4]);
     pack(to, i, f, s.opacity, f.z > view.near_m, frame);
     pack_features(to, i, features);
 }
@@ -147,13 +149,21 @@ inline float log_alpha(const float4& a, const float4& b, float dx, float dy) {
     return fmaf(-p, p, fmaf(-q, q, b.y));
 }
 
-// Store geometry relative to the centre of the tile whose corner is (x, y), in the layout of `log_alpha`.
-inline void store_about_center(const Geometry& g, float x, float y, float* to) {
+// Store geometry relative to the centre of the tile whose corner is (x, y), in the layout of `log_alpha`; then depth there
+// and slope_u. features: those of the splat.
+inline void store_about_center(const Geometry& g, const float* features, float x, float y, float* to) {
     const float u = g.u - (x + (TILE - 1) * 0.5f), v = g.v - (y + (TILE - 1) * 0.5f);
     float4* row = reinterpret_cast<float4*>(to);
     row[0] = make_float4(g.l1, g.l2, g.l3, -fmaf(g.l1, u, g.l2 * v));
-    row[1] = make_float4(-g.l3 * v, g.log_opacity, g.z, 0.f);
+    const float z = RAYS ? fmaf(-features[DEPTH], v, fmaf(-g.slope_u, u, g.z)) : g.z;
+    row[1] = make_float4(-g.l3 * v, g.log_opacity, z, g.slope_u);
 }
+
+// A splat's depth at a pixel, from its row in that layout, of which b is the second float4.
+inline float depth_at(const float* row, const float4& b, float dx, float dy) {
+    return RAYS ? fmaf(row[GEOMETRY + DEPTH], dy, fmaf(b.w, dx, b.z)) : b.z;
+}
+inline float feature_at(const float* row, int c, float depth) { return RAYS && c == DEPTH ? depth : row[GEOMETRY + c]; }
 
 template <bool MOMENT, bool IDS>
 inline void blend_tile(const Frame& frame, const float* rows, const Lists& lists, const float* reference, int used, const Planes& out) {
@@ -166,7 +176,7 @@ inline void blend_tile(const Frame& frame, const float* rows, const Lists& lists
     const int begin = listed ? lists.tile_begin[tile] : 0, count = listed ? lists.tile_begin[tile + 1] - begin : int(lists.n);
     const Pixel pixel = pixel_of_thread(frame);
     const float ref = MOMENT && pixel.inside ? reference[pixel.at] : 0.f;
-    float sum[FEATURES] = {}, moment = 0.f, light = pixel.inside ? 1.f : 0.f, best = 0.f, median_weight = 0.f, median_z = 0.f;
+    float sum[COUNT] = {}, moment = 0.f, light = pixel.inside ? 1.f : 0.f, best = 0.f, median_weight = 0.f, median_z = 0.f;
     int dominant = -1, median = -1;
     for (int first = 0; first < count; first += BATCH) {
         if (__syncthreads_and(!pixel.inside || light < frame.stop)) break;
@@ -177,8 +187,9 @@ inline void blend_tile(const Frame& frame, const float* rows, const Lists& lists
             const bool here = listed || (lists.counts[i] && reaches_tile(g, frame, tile_x, tile_y));
             ids[t] = i;
             patches[t] = here ? patches_reached(g, frame, float(tile_x * TILE), float(tile_y * TILE)) : 0u;
-            store_about_center(g, float(tile_x * TILE), float(tile_y * TILE), batch + t * SHARED_ROW);
-            const float4* from = reinterpret_cast<const float4*>(rows + size_t(i) * ROW + GEOMETRY);
+            const float* features = rows + size_t(i) * ROW + GEOMETRY;
+            store_about_center(g, features, float(tile_x * TILE), float(tile_y * TILE), batch + t * SHARED_ROW);
+            const float4* from = reinterpret_cast<const float4*>(features);
             float4* to = reinterpret_cast<float4*>(batch + t * SHARED_ROW + GEOMETRY);
             for (int c = 0; c < SLOTS / 4; c++) to[c] = from[c];
         }
@@ -190,21 +201,22 @@ inline void blend_tile(const Frame& frame, const float* rows, const Lists& lists
             const float power = log_alpha(a, b, pixel.dx, pixel.dy);
             if (!(power >= frame.log_alpha_min && light >= frame.stop)) continue;
             const float alpha = fminf(exp2f(power), ALPHA_MAX), w = light * alpha;
-            for (int c = 0; c < FEATURES; c++) sum[c] = fmaf(w, row[GEOMETRY + c], sum[c]);
+            const float depth = depth_at(row, b, pixel.dx, pixel.dy);
+            for (int c = 0; c < COUNT; c++) sum[c] = fmaf(w, feature_at(row, c, depth), sum[c]);
             if (MOMENT) {
-                const float off = b.z - ref;
+                const float off = depth - ref;
                 moment = fmaf(w * off, off, moment);
             }
             if (IDS) {
                 if (w > best) { best = w; dominant = ids[j]; }
-                if (light >= 0.5f) { median = ids[j]; median_weight = w; median_z = b.z; }
+                if (light >= 0.5f) { median = ids[j]; median_weight = w; median_z = depth; }
             }
             light = fmaf(-light, alpha, light);
         }
     }
     if (!pixel.inside) return;
     const size_t plane = size_t(frame.width) * frame.height;
-    for (int c = 0; c < FEATURES; c++)
+    for (int c = 0; c < COUNT; c++)
         if (c < used) out.sums[c * plane + pixel.at] = sum[c];
     out.alpha[pixel.at] = 1.f - light;
     if (MOMENT) out.moment[pixel.at] = only(ref > 0.f, moment);

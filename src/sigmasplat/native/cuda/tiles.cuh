@@ -43,7 +43,8 @@ struct Packed { float* rows; Box* boxes; int* counts; float* depths; unsigned ch
 // Store a splat's geometry, the box of tiles that its bounds meet, how many of them it really reaches, and the depth
 // for sorting: infinite if it reaches none.
 inline void pack(const Packed& to, int i, const Footprint<float>& f, float opacity, bool seen, const Frame& frame) {
-    Geometry g = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v, log2f(fmaxf(opacity, 1e-30f)), f.z, 0.f};
+    const float log_opacity = log2f(fmaxf(opacity, 1e-30f)), slope_u = RAYS ? f.slope_u : 0.f;
+    Geometry g = {f.l1 * CONIC_SCALE, f.l2 * CONIC_SCALE, f.l3 * CONIC_SCALE, f.u, f.v, log_opacity, f.z, slope_u};
     const float reach = g.log_opacity - frame.log_alpha_min, radius2 = fmaxf(reach, 0.f) * (2.f / LOG2_E) * 1.0002f;
     const float du = sqrtf(radius2 * f.var_u) + 1e-3f, dv = sqrtf(radius2 * f.var_v) + 1e-3f;
     seen = seen && reach > 0.f && f.u + du >= 0.f && f.v + dv >= 0.f && f.u - du <= frame.width - 1.f && f.v - dv <= frame.height - 1.f;
@@ -63,7 +64,7 @@ inline void pack(const Packed& to, int i, const Footprint<float>& f, float opaci
     to.depths[i] = count ? f.z : __int_as_float(0x7f800000);
     float4* row = reinterpret_cast<float4*>(to.rows + size_t(i) * ROW);
     row[0] = make_float4(g.l1, g.l2, g.l3, g.u);
-    row[1] = make_float4(g.v, g.log_opacity, g.z, 0.f);
+    row[1] = make_float4(g.v, g.log_opacity, g.z, g.slope_u);
 }
 inline void pack_features(const Packed& to, int i, const float* features) {   // SLOTS features
     float4* row = reinterpret_cast<float4*>(to.rows + size_t(i) * ROW + GEOMETRY);

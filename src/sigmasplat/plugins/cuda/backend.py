@@ -1,10 +1,9 @@
 """Offer CUDA as a backend: how it renders, and what it does of the fits."""
 
-import warnings
 from dataclasses import replace
 from types import ModuleType
 
-from sigmasplat.api import TORCH, Backend, DeviceFits, RenderConfig, reference_maps
+from sigmasplat.api import TORCH, Backend, DeviceFits, reference_maps
 from sigmasplat.plugins.cuda import descent, images, launch
 from sigmasplat.plugins.cuda.mapping_step import CudaStep, CudaViewDependentStep, to_host
 from sigmasplat.plugins.cuda.view import CudaView
@@ -14,14 +13,6 @@ def _operators() -> ModuleType:
     from sigmasplat.plugins.cuda import operators
 
     return operators
-
-
-def _options(options: RenderConfig) -> RenderConfig:
-    """Return the options that CUDA renders with: it has only `render.depth=center`, and warns."""
-    if options.depth == "center":
-        return options
-    warnings.warn("render.depth=ray does not run on CUDA yet; depth is that of the splats' centres", stacklevel=4)
-    return replace(options, depth="center")
 
 
 def _fits() -> DeviceFits:
@@ -38,6 +29,6 @@ def _fits() -> DeviceFits:
 
 
 PLUGIN = Backend(
-    "cuda", _operators, lambda camera, options, variance: CudaView(camera, _options(options), variance), _fits,
-    _options, lambda: launch.this_device(),
+    "cuda", _operators, lambda camera, options, variance: CudaView(camera, options, variance), _fits,
+    lambda: launch.this_device(),
 )  # fmt: skip

@@ -23,7 +23,9 @@ FITTING = 0
 """Used instead of a feature count for the program of the fits' loops, which has no feature count."""
 ALIGNING = -1
 """The same for the program that aligns images."""
-PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS)
+RAYS = (-4, -7)
+"""The same for the programs of views with `render.depth=ray`: their feature counts, negative."""
+PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS, *RAYS)
 INSTALL = install_extra("gpu")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
 """For drivers that support only CUDA 12."""

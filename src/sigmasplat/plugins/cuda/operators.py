@@ -110,5 +110,6 @@ class _Blend(torch.autograd.Function):
         return on_means2d, on_conics, on_z, None, on_opacities, on_features, None, None, None
 
 
+depth_slopes = reference.depth_slopes
 project = project_with(_Project, reference.project)
 blend = blend_with(_Blend, FEATURES_AT_ONCE, reference.blend)

@@ -24,6 +24,8 @@ GEOMETRY = 8
 """Number of floats in a splat's row before its features (native/cuda/device.cuh)."""
 MOMENTS = 6
 """Number of sums in a record before those of the features (native/cuda/gradients.cuh)."""
+RAY_MOMENT_AT, RAY_MOMENT_SUMS = 16, 9
+"""With depth along the ray: where the sums of the moment begin in a record, and their number."""
 SPARE = 1.25
 """Memory is allocated for this multiple of the number of pairs in the last image."""
 MOST_PAIRS = 2**31 - 1
@@ -55,12 +57,14 @@ class Raster:
         self._launch, self.device, self.capacity = launch, device, capacity
         self.n = 0
 
-    def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig) -> None:
-        """Allocate for n splats with `used` features."""
-        self.n, self.used, self.features = n, used, program_for(used)
+    def prepare(self, n: int, used: int, camera: Camera, options: RenderConfig, rays: bool = False) -> None:
+        """Allocate for n splats with `used` features; rays: of a view whose depth is along the ray."""
+        self.n, self.used, self.rays = n, used, rays
+        features = program_for(used)
+        self.features = -features if rays else features
         self.tiles_x, self.tiles_y = -(-camera.width // TILE), -(-camera.height // TILE)
         self.frame = _frame(camera, options, self.tiles_x, self.tiles_y)
-        self.rows = self.empty(n, GEOMETRY + -(-self.features // 4) * 4)
+        self.rows = self.empty(n, GEOMETRY + _rounded(features))
         self.boxes, self.counts = self.empty(n, 4, dtype=torch.int16), self.empty(n, dtype=torch.int32)
         self.depths, self.visible = self.empty(n), self.empty(n, dtype=torch.uint8)
 
@@ -158,8 +162,9 @@ class Raster:
         """Sum the planes' gradients over pixels, per splat. Return the records [n, R], and the position in a record of
         the moment's two sums (0 = none)."""
         self.make_room()
-        moment = MOMENTS + self.features if on_moment is not None else 0
-        floats = _rounded(moment + 2 if moment else MOMENTS + self.features)
+        end = MOMENTS + abs(self.features)
+        moment = 0 if on_moment is None else RAY_MOMENT_AT if self.rays else end
+        floats = _rounded(moment + (RAY_MOMENT_SUMS if self.rays else 2) if moment else end + 2 * self.rays)
         kernel = "blend_backward_moment" if moment else "blend_backward"
         outputs = Planes(planes.sums, planes.moment if moment else None, planes.alpha)
         records = self.empty(self._room, floats)
@@ -174,7 +179,7 @@ class Raster:
         there is, and if not all pairs fit, all sums are 0."""
         if not within:
             self.make_room()
-        records = self.empty(self._room, _rounded(MOMENTS + 4))
+        records = self.empty(self._room, _rounded(MOMENTS + 4 + 2 * self.rays))
         outputs = Planes(planes.sums, None, planes.alpha)
         self.launch(
             "blend_backward_pose", self.tiles_x * self.tiles_y, self.frame, self.rows, self._lists, self.slots,

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sigmasplat.api import BackendError, Camera, Layers, Matrix, RenderConfig, SensorModel, view_params
+from sigmasplat.api import Camera, Layers, Matrix, RenderConfig, SensorModel, view_params
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.raster import Planes, Raster
 
@@ -22,8 +22,6 @@ class CudaView:
     def __init__(
         self, camera: Camera, options: RenderConfig, variance: bool = True, device: torch.device | None = None
     ) -> None:
-        if options.depth == "ray":
-            raise BackendError("render.depth=ray does not run on CUDA yet; add --set render.depth=center")
         device = device or cuda_launch.this_device()
         self.camera, self.options = camera, options
         self.raster = Raster(cuda_launch.launcher_for(device), device)
@@ -50,7 +48,7 @@ class CudaView:
     def _render(self, params: Tensor, pose: Tensor | None) -> None:
         """Render at `_params`, or at a pose that is on the device; the host does not wait then."""
         r, n, params = self.raster, len(params), self._on_device(params)
-        r.prepare(n, len(self.sums), self.camera, self.options)
+        r.prepare(n, len(self.sums), self.camera, self.options, self.options.depth == "ray")
         r.each_splat("pack_view", self._params, pose, params, n, r.frame, r.packed)
         r.bin(within=pose is not None)
         r.blend(self._planes, self._reference if self._made[0] else None)
@@ -81,11 +79,18 @@ class CudaView:
         return twists.sum(0)
 
     def _on_median(self) -> Tensor:
-        """Sum ∂L/∂(median depth) over the pixels whose median depth is that of each splat, [n]."""
-        ids, found = self.layers.median_id.flatten().long(), torch.zeros(self.raster.n + 1, device=self.raster.device)
+        """Sum ∂L/∂(median depth) over the pixels whose median depth is that of each splat, [n, 1]; with depth along the
+        ray also its products with the pixel's position relative to the splat's mean, [n, 3]."""
+        ids, given = self.layers.median_id.flatten().long(), self.g_median_depth.flatten()[:, None]
+        if self.raster.rays and self.raster.n:
+            height, width = self.alpha.shape
+            at = torch.arange(height * width, device=given.device)
+            pixels = torch.stack([at % width, at // width], 1)
+            given = torch.cat([given, given * (pixels - self.raster.rows[ids, 3:5])], 1)
+        found = torch.zeros(self.raster.n + 1, given.shape[1], device=given.device)
         # Pixels without a median splat (−1) are added to the last row. torch sorts the indices, so that the sums are
         # the same every time. The last argument promises that the rows exist, so that the host does not wait to check.
-        torch.ops.aten._index_put_impl_(found, [ids], self.g_median_depth.flatten(), True, True)
+        torch.ops.aten._index_put_impl_(found, [ids], given, True, True)
         return found[:-1]
 
     def backward_pose(self, params: Tensor) -> Matrix:
