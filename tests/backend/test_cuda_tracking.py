@@ -38,6 +38,7 @@ STEPS = TrackingConfig(lr_rotation=4e-4, lr_translation=1e-3, tau=5.0)
 WAYS = {
     "ours": STEPS,
     "exposed": changed(STEPS, exposure=True, lr_exposure=4e-3),
+    "amsgrad": changed(STEPS, amsgrad=True, exposure=True),
     "paper": PAPER,
     "paper, exposed": dataclasses.replace(PAPER, exposure=True, uncertainty=True, tau=2.0),
 }

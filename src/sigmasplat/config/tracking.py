@@ -45,10 +45,10 @@ class TrackingConfig(Section, name="tracking"):
     """Weight of gray residuals in alignment; depth residuals have 1 minus this."""
     descent: Literal["quaternion", "amsgrad", "axis-angle", "axis-angle-start"] = "quaternion"
     """What `method` adam descends over. quaternion: a quaternion and a translation relative to the initial guess, with
-    errors averaged over all pixels; amsgrad: the same with AMSGrad, on the host even with a CUDA device; axis-angle:
-    the axis-angle rotation and the position of the camera, with errors averaged over the pixels that each of
-    colour and depth uses, colour only below 10 times its median error; axis-angle-start: the same with 200 steps for
-    the second frame, which has no motion model yet, and a rotation of 3e-3 rad per step there."""
+    errors averaged over all pixels; amsgrad: the same with AMSGrad; axis-angle: the axis-angle rotation and the
+    position of the camera, with errors averaged over the pixels that each of colour and depth uses, colour only below
+    10 times its median error; axis-angle-start: the same with 200 steps for the second frame, which has no motion
+    model yet, and a rotation of 3e-3 rad per step there."""
     lr_rotation: NotNegative = 2e-3
     """Learning rate of rotation, radians per step; with quaternions the angle per step is twice as large. Use a higher
     one for fast motion."""

@@ -14,6 +14,7 @@ KERNEL drop_pairs(Pairs pairs, int n, int* counts) {
 
 struct Descending {                        // layout: plugins/cuda/descent.py
     double numbers[7], moment1[9], moment2[9];        // pose parameters, rotation first; Adam's moments, exposure's last
+    double largest[9], amsgrad;                       // second moments so far; 1: AMSGrad, 0: Adam
     double exposure[2], best_exposure[2];             // (a, b)
     double T[12], best_T[12];                         // T_camera_world, rows of [R | t]: now, and at the smallest loss
     double first, best, lowered;                      // losses; lowered: when it last fell by the share of a plateau
@@ -114,12 +115,13 @@ inline void pose_of_quaternion(const double* numbers, const double* guess, doubl
     }
 }
 
-// Return Adam's update of number k at a rate (fit/adam.py: VectorAdam).
+// Return Adam's or AMSGrad's update of number k at a rate (fit/adam.py: VectorAdam, VectorAmsgrad).
 inline double adam_update(Descending& d, const DescentNumbers& n, int k, double gradient, double rate) {
     d.moment1[k] += (1.0 - n.beta1) * (gradient - d.moment1[k]);
     d.moment2[k] += (1.0 - n.beta2) * (gradient * gradient - d.moment2[k]);
-    const double steps = double(d.steps);
-    const double unbiased1 = d.moment1[k] / (1.0 - pow(n.beta1, steps)), unbiased2 = d.moment2[k] / (1.0 - pow(n.beta2, steps));
+    d.largest[k] = fmax(d.largest[k], d.moment2[k]);
+    const double steps = double(d.steps), spread = d.amsgrad > 0.0 ? d.largest[k] : d.moment2[k];
+    const double unbiased1 = d.moment1[k] / (1.0 - pow(n.beta1, steps)), unbiased2 = spread / (1.0 - pow(n.beta2, steps));
     return -rate * unbiased1 / (sqrt(unbiased2) + n.epsilon);
 }
 

@@ -25,7 +25,6 @@ from sigmasplat.api import (
     Matrix,
     Target,
     TrackingConfig,
-    descend,
     exposure_rate,
     parametrisation,
     tracking_params,
@@ -94,9 +93,10 @@ GRAPH_FROM = 12
 """Minimum number of remaining iterations for a CUDA graph; with fewer, recording costs more than it saves."""
 STATE = np.dtype(
     [
-        ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("exposure", "f8", 2),
-        ("best_exposure", "f8", 2), ("T", "f8", (3, 4)), ("best_T", "f8", (3, 4)), ("first", "f8"), ("best", "f8"),
-        ("lowered", "f8"), ("waited", "i8"), ("steps", "i8"), ("stopped", "i8"), ("missing", "i8"),
+        ("numbers", "f8", 7), ("moment1", "f8", 9), ("moment2", "f8", 9), ("largest", "f8", 9), ("amsgrad", "f8"),
+        ("exposure", "f8", 2), ("best_exposure", "f8", 2), ("T", "f8", (3, 4)), ("best_T", "f8", (3, 4)),
+        ("first", "f8"), ("best", "f8"), ("lowered", "f8"), ("waited", "i8"), ("steps", "i8"), ("stopped", "i8"),
+        ("missing", "i8"),
     ]
 )  # fmt: skip
 """The layout of the kernels' `Descending` (native/cuda/descend.cuh)."""
@@ -105,9 +105,9 @@ STATE = np.dtype(
 def descend_on_device(
     params: Tensor, view: CudaView, target: Target, T_camera_world: Matrix, config: TrackingConfig, iterations: int
 ) -> Descent:
-    """Minimise the tracking loss as `descend` does; AMSGrad, and colour at textured pixels alone, run on the host.
-    Raises BackendError if there are too many pairs of splats and tiles."""
-    if config.amsgrad or target.textured is not None:
+    """Minimise the tracking loss as `descend` does; colour at textured pixels alone runs on the host. Raises
+    BackendError if there are too many pairs of splats and tiles."""
+    if target.textured is not None:
         return descend(params, view, target, T_camera_world, config, iterations)
     if view.raster.capacity is None:
         view.forward(params, T_camera_world)  # measures how many pairs to expect
@@ -203,7 +203,7 @@ def _state_of(copied: HostCopy) -> np.void:
 
 def _at_rest(T_camera_world: Matrix, config: TrackingConfig) -> NDArray[np.void]:
     way, state = parametrisation(config, T_camera_world), np.zeros((), STATE)
-    numbers = way.start
+    numbers, state["amsgrad"] = way.start, config.amsgrad
     state["numbers"][: len(numbers)], state["T"], state["best_T"] = numbers, way.pose(numbers)[:3], T_camera_world[:3]
     state["first"] = state["best"] = state["lowered"] = np.inf
     return state
