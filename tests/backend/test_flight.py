@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -38,8 +39,8 @@ def packed(archive: Path) -> dict[str, bytes]:
 def test_the_whole_flight_is_rehearsed(emulator: Emulator, tmp_path: Path) -> None:
     done = fly("--rehearse", OUT=tmp_path, REHEARSAL=emulator.folder, PATIENCE=10)
     files = packed(tmp_path / "flight-a.tar.gz") | packed(tmp_path / "flight-b.tar.gz")
-    ends = {line.partition(":")[0]: line.split(" s: ")[0] for line in done.stdout.splitlines() if ": exit " in line}
-    assert {name: end.split(",")[0] for name, end in ends.items()} == {n: f"{n}: exit 0" for n in A + B}, done.stdout
+    ends = dict(re.findall(r"^(\w+): (exit \d+)", done.stdout, re.MULTILINE))
+    assert ends == dict.fromkeys(A + B, "exit 0"), done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"flight-a.tar.gz", "flight-b.tar.gz", "summary.txt"}
     assert {f"{name}.log" for name in A + B} <= files.keys() and "machine.txt" in files
     written = [json.loads(text) for name, text in files.items() if name.startswith("results/")]
