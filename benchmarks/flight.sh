@@ -238,7 +238,7 @@ case ${1:-} in
     ncu=("${python[@]}" --tool ncu) sanitizer=("${python[@]}" --tool compute-sanitizer)
     chosen=(-k "view_agrees") recordings=(synthetic:frames=200,width=48,height=36) sizes=(--width 48 --frames 2)
     settings=(--settings {mapping.{first_,},tracking.}iterations=1 seeding.first_{uniform,gradient}=50)
-    scene=(--splats 100 --size 64 48) scenes=(--splats 100 --sizes 64 48 --runs 1) ;;
+    scene=(--splats 60 --size 32 24) scenes=(--splats 60 --sizes 32 24 --runs 1) ;;
   *) sed -n '4,11s/^# *//p' "$0"; exit 2 ;;
 esac
 [ -n "$rehearsed" ] || ! "$PYTHON" -c 'import xdist' 2>/dev/null || many=(-n 4)

@@ -47,7 +47,7 @@ def test_the_whole_flight_is_rehearsed(emulator: Emulator, tmp_path: Path) -> No
     assert {each["name"] for each in written} == RESULTS
     for each in written:
         assert each["figures"]["device"]["name"] == "stand-in" and "driver" in each["figures"]["device"]
-        assert each["commit"] and len(each["code"]) > 20
+        assert each["commit"] and each["code"]
     assert not [name for name, text in files.items() if name.endswith(".log") and b"Traceback" in text]
 
 
