@@ -25,6 +25,7 @@ from sigmasplat.api import (
     Matrix,
     Target,
     TrackingConfig,
+    descend,
     exposure_rate,
     parametrisation,
     tracking_params,
