@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from sigmasplat.config import InputConfig
 from sigmasplat.data import se3
-from sigmasplat.data.trajectory import Trajectory
+from sigmasplat.data.trajectory import MOST_M, Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import ASSUMED, Origin
@@ -49,10 +49,14 @@ def to_matrix(where: str, values: Any) -> Matrix:
 def checked_pose(where: str, T: Matrix) -> Matrix | None:
     """Return a camera-to-world pose, None if it is not finite, which marks a frame without a pose.
 
-    Raises SourceError naming `where` if the matrix is finite but not rigid.
+    Raises SourceError naming `where` if the matrix is finite but not rigid, or too far from the origin.
     """
     if not np.isfinite(T).all():
         return None
+    if (far_m := np.abs(T[:3, 3]).max()) > MOST_M:
+        raise SourceError(
+            f"{where}: the pose is {far_m:.3g} m from the origin, more than {MOST_M:g}; delete or correct it"
+        )
     if not se3.is_rigid(T, RIGID_TOLERANCE):
         numbers = " ".join(f"{value:.3g}" for value in T.reshape(-1)[:12])
         raise SourceError(f"{where}: not a rigid camera-to-world pose: {numbers}; delete it or correct its rotation")

@@ -94,7 +94,7 @@ class Earlier:
         if not len(read):
             return self
         moved_rad = se3.angle_between(np.eye(4), self.T_earlier_live, float(upper_median(read)))
-        return replace(self, further_px=int(POSE_ERROR * camera.fx * moved_rad))
+        return replace(self, further_px=int(min(POSE_ERROR * camera.fx * moved_rad, camera.width)))
 
 
 @lru_cache(maxsize=8)
