@@ -21,31 +21,31 @@ from sigmasplat.errors import SigmaSplatError
 from sigmasplat.plugins.evaluation.view_scores import scored_view
 from sigmasplat.plugins.outputs.drawing.view_panels import BACKGROUND, ViewPanel, draw_view_strip, view_panels
 from sigmasplat.plugins.outputs.run_reader import RunReader
-from sigmasplat.plugins.outputs.video import Film, orbit_view
+from sigmasplat.plugins.outputs.video import Film
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.render import FieldRenderer
 from sigmasplat.run_folder.runs import RunFolder
 
 arg = tyro.conf.arg
-DIRECTIONS = 36
-"""Steps of the orbit around the map, from which the last panel's view is chosen."""
+BACK_M, UP_M, DOWN_RAD = 0.8, 0.6, 0.35
+"""How far behind and above the camera of the first panels the last one looks from, and how much further down."""
 Run = Annotated[Path, tyro.conf.Positional, arg(help="folder of a finished run")]
 Index = Annotated[int, arg(help="frame of the first three panels")]
-Direction = Annotated[int, arg(help=f"direction of the last panel, 0 to {DIRECTIONS - 1}")]
 Out = Annotated[Path, arg(help="picture to write")]
 
 
-def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
+def panels(run: RunFolder, index: int) -> list[ViewPanel]:
     """Render the four panels. Raises RunError or SourceError where run or sequence cannot be read."""
     reader, source = RunReader(run), open_source(run.facts()["source_path"])
     config, field = reader.config, run.read_map()
     renderer = FieldRenderer(config.render, config.backend)
     frame = source.frame(index).prepared(0, config.input.min_depth_m, config.input.max_depth_m)
-    T_camera_world = se3.inverse(reader.poses_of([index]).T_world_camera[0])
+    T_world_camera = reader.poses_of([index]).T_world_camera[0]
+    T_camera_above = se3.exp(np.array([0.0, 0.0, 0.0, -DOWN_RAD, 0.0, 0.0]))
+    T_camera_above[:3, 3] = 0.0, -UP_M, -BACK_M
     with torch.inference_mode():
-        view = scored_view(frame, renderer(field, frame.camera, T_camera_world), "")
-        film, poses = orbit_view(Film.of(reader, frame.camera, renderer), reader.valid_path(), DIRECTIONS)
-        above = film.seen(poses[direction % DIRECTIONS])
+        view = scored_view(frame, renderer(field, frame.camera, se3.inverse(T_world_camera)), "")
+        above = Film.of(reader, frame.camera, renderer).seen(T_world_camera @ T_camera_above)
     backdrop = np.array(BACKGROUND, np.float32) / 255.0
     seen = above.color.numpy() + (1.0 - above.alpha.numpy()[..., None]) * backdrop
     pixels = (np.clip(seen, 0.0, 1.0) * 255.0).round().astype(np.uint8)
@@ -58,12 +58,10 @@ def panels(run: RunFolder, index: int, direction: int) -> list[ViewPanel]:
     ]
 
 
-def main(
-    run: Run, frame: Index = 250, direction: Direction = 0, out: Out = record.ROOT / "docs" / "images" / "scan.jpg"
-) -> int:
+def main(run: Run, frame: Index = 250, out: Out = record.ROOT / "docs" / "images" / "scan.jpg") -> int:
     """Draw the picture of a real scan; exit code 2 if the run or its sequence cannot be read."""
     try:
-        drawn = panels(RunFolder.open(run), frame, direction)
+        drawn = panels(RunFolder.open(run), frame)
     except SigmaSplatError as problem:
         print(f"picture.py: {problem}", file=sys.stderr)
         return 2
