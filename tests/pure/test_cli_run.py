@@ -497,7 +497,7 @@ def test_the_end_of_a_run_is_a_sentence_six_figures_and_the_next_commands(
     assert lines[1:5] == ["Images with a pose 6 of 6", "ATE RMSE 1.23 cm", "PSNR, held-out images 27.31 dB",
                           "Depth L1, held-out images – cm"]  # fmt: skip
     assert lines[7].startswith("report: ") and lines[7].endswith("report.html")
-    assert lines[8:] == ["next: sigmasplat view 'my room'", "sigmasplat export 'my room' --out 'my room'.spz",
+    assert lines[8:] == ["next: sigmasplat view 'my room'", "sigmasplat share 'my room' --out 'my room'.html",
                          "sigmasplat mesh 'my room' --out 'my room'.glb"]  # fmt: skip
     assert exit_code("run", "corridor", "--out", "unscored", "--no-eval") == 0
     assert capsys.readouterr().out.splitlines()[-1] == "next: sigmasplat eval unscored"

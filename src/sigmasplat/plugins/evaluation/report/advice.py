@@ -20,7 +20,7 @@ def next_commands(run: str) -> list[Advice]:
     path, name = shlex.quote(run), shlex.quote(PurePath(run).name)
     return [
         ("View the map in 3D, and measure distances:", f"sigmasplat view {path}"),
-        ("Write the map for other viewers:", f"sigmasplat export {path} --out {name}.spz"),
+        ("Send the map to someone, as one page:", f"sigmasplat share {path} --out {name}.html"),
         ("Write a mesh for other programs:", f"sigmasplat mesh {path} --out {name}.glb"),
     ]
 
