@@ -85,11 +85,13 @@ def test_covariances_equal_rotated_squared_scales() -> None:
         np.testing.assert_allclose(covariance, R @ np.diag(scale.astype(float) ** 2) @ R.T, rtol=1e-4, atol=1e-8)
 
 
-def test_the_palette_ends_at_a_high_percentile_of_the_visible_splats() -> None:
+def test_the_palette_covers_nearly_all_splats_that_are_shown() -> None:
     pieces = [Piece(0, field_of(600)), Piece(1, field_of(400, seed=1))]
     values = np.concatenate([uncertainties(piece).numpy() for piece in pieces])
-    assert palette_range(pieces) == (0.0, pytest.approx(np.percentile(values, 99)))
-    assert palette_range(()) == (0.0, 1.0)
+    assert palette_range(pieces, False) == pytest.approx(np.percentile(values, [2, 98]))
+    small = [replace(piece, sure=uncertainties(piece) < 0.1) for piece in pieces]
+    assert palette_range(small, False)[1] < 0.1 and palette_range(small, True) == palette_range(pieces, False)
+    assert palette_range((), False) == (1.0, 2.0)
 
 
 def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
@@ -97,12 +99,13 @@ def test_splats_are_coloured_by_their_own_colour_or_by_sigma() -> None:
     sigma = uncertainties(Piece(None, field))
     plain = splat_arrays(Piece(None, field), None, True)
     np.testing.assert_array_equal(plain.colors, (field.colors.numpy() * 255).round().astype(np.uint8))
-    tinted = splat_arrays(Piece(None, field), (0.0, 0.3), False)
-    np.testing.assert_array_equal(tinted.colors, colormap.apply(sigma.numpy(), 0.0, 0.3, colormap.INFERNO))
+    tinted = splat_arrays(Piece(None, field), (0.02, 0.3), False)
+    ratios = np.log(np.maximum(sigma.numpy(), 0.02) / 0.02)
+    np.testing.assert_allclose(tinted.colors, colormap.apply(ratios, 0.0, np.log(0.3 / 0.02), colormap.INFERNO), atol=1)
     np.testing.assert_array_equal(tinted.centers, field.means.numpy())
     most, least = int(sigma.numpy().argmax()), int(sigma.numpy().argmin())
     assert tinted.colors[most].sum() > tinted.colors[least].sum() + 200
-    half = splat_arrays(Piece(None, field, sure=sigma < sigma.median()), (0.0, 0.3), False)
+    half = splat_arrays(Piece(None, field, sure=sigma < sigma.median()), (0.02, 0.3), False)
     assert len(half.centers) == len(half.covariances) == len(half.colors) == int((sigma < sigma.median()).sum())
 
 

@@ -104,7 +104,7 @@ class ViewerApp:
         known = len(pieces) == 1 and pieces[0].uncertainty is not None  # as `layers.merged`
         unit = " m" * any(piece.depth_std_m is not None for piece in pieces)
         panel.offer(known, any(piece.sure is not None and not piece.sure.all() for piece in pieces))
-        span = layers.palette_range(pieces) if panel.colouring.value == "how unsure" else None
+        span = layers.palette_range(pieces, panel.unsure.value) if panel.colouring.value == "how unsure" else None
         with self.server.atomic():
             self._draw_path(snapshot)
             self._draw_splats(pieces, span)

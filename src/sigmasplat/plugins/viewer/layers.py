@@ -25,10 +25,6 @@ def uncertainties(piece: Piece) -> Tensor:
     return piece.field.variances.mean(1).sqrt() if piece.depth_std_m is None else piece.depth_std_m
 
 
-MIN_VISIBLE_OPACITY = 0.1
-"""Splats with a lower opacity are ignored when the range of uncertainties is computed."""
-
-
 class SplatArrays(NamedTuple):
     """N splats to draw: centers [N, 3] m and covariances [N, 3, 3] m² in the piece's frame, colors [N, 3] uint8,
     opacities [N, 1]."""
@@ -44,19 +40,22 @@ def shown(piece: Piece, unsure: bool) -> Tensor:
     return torch.ones(len(piece.field), dtype=torch.bool) if unsure or piece.sure is None else piece.sure
 
 
-def palette_range(pieces: Sequence[Piece]) -> tuple[float, float]:
-    """Return the range of uncertainties that the palette covers: from 0 to a high percentile of the visible splats."""
-    values = np.concatenate([np.empty(0, np.float32), *(uncertainties(piece).numpy() for piece in pieces)])
-    visible = np.concatenate([np.empty(0, bool), *(p.field.opacities.numpy() >= MIN_VISIBLE_OPACITY for p in pieces)])
-    return colormap.from_zero(values, visible)
+def palette_range(pieces: Sequence[Piece], unsure: bool) -> tuple[float, float]:
+    """Return the range of uncertainties that the palette covers, in equal ratios: that of nearly all shown splats."""
+    values = [uncertainties(piece)[shown(piece, unsure)].numpy() for piece in pieces]
+    if not sum(map(len, values)):
+        return 1.0, 2.0
+    low, high = np.quantile(np.concatenate(values), (0.02, 0.98))
+    return max(float(low), 1e-9), float(high)
 
 
 def splat_arrays(piece: Piece, span: tuple[float, float] | None, unsure: bool) -> SplatArrays:
-    """Return the shown splats coloured by uncertainty over the range `span`, or in their own colours if None."""
+    """Return the shown splats in their own colours, or by uncertainty, in equal ratios over the range `span`."""
     mask = shown(piece, unsure)
     chosen = field_without_moments(piece.field.params[mask], {})
     if span is not None:
-        colors = colormap.apply(uncertainties(piece)[mask].numpy(), *span, colormap.INFERNO)
+        values = np.log(uncertainties(piece)[mask].clamp(min=span[0]).numpy())
+        colors = colormap.apply(values, *np.log(span), colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     spread = covariances(chosen.quats.numpy(), chosen.scales.numpy())
