@@ -86,7 +86,11 @@ PAGES = {
             Shown(
                 "export-sizes",
                 "What a smaller file costs in image quality (PSNR of held-out views, relative to the map's).",
-                without=("PSNR, dB", "≤ 3 MB, ≥ 99%"),
+                without=("PSNR, dB", "write, s", "read, s", "≤ 3 MB, ≥ 99%"),
+            ),
+            Shown(
+                "first-look", "The viewer and a shared page in Chromium with software WebGL.",
+                without=("splats", "phone, frames/s"),
             ),
             Shown("four-frames", "Geometry from four frames at true poses, scored at later frames.", only=("fitted",)),
             Shown(

@@ -1,9 +1,13 @@
-"""The viewer memory benchmark: its simulated system grows like a run, and its tables compare with the goals."""
+"""The benchmarks of the viewer: its memory while a simulated system grows, and how soon a map is seen."""
 
 import importlib
 import sys
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -13,7 +17,7 @@ from sigmasplat.plugins.viewer.snapshot_sources import LiveView
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-viewer_memory = importlib.import_module("viewer_memory")
+viewer_memory, first_look = importlib.import_module("viewer_memory"), importlib.import_module("first_look")
 
 
 def figures(resident_mib: list[float], clients: int = 1, minutes: float = 10.0) -> dict[str, Any]:
@@ -51,3 +55,33 @@ def test_the_simulated_system_is_shown_like_a_real_one(tmp_path: Path, monkeypat
     assert max(sum(len(p.field) for p in snapshot.pieces) for snapshot in shown) <= 500
     assert np.flatnonzero(last.path.lost).tolist() == [0]
     assert last.image(0) is not None and last.image(45) is not None
+
+
+def test_the_first_look_has_a_row_for_each_run_and_says_when_others_used_the_machine() -> None:
+    pages = [
+        {"run": run, "shown": shown, "size": size, "splats": 50_000, "ready_s": 3.0, "page_bytes": page,
+         "data_bytes": data, "first_s": first_s, "frames_per_s": 4.0}
+        for run in ("desk", "kitchen")
+        for shown, size, page, data, first_s in (
+            ("viewer", (1280, 800), 700_000, 1_600_000, 2.0), ("shared page", (1280, 800), 1_100_000, None, 1.5),
+            ("shared page", (390, 844), 1_100_000, None, 1.0),
+        )
+    ]  # fmt: skip
+    measured = {"machine": {"cores": 2}, "figures": {"load_average": 0.1, "pages": pages}}
+    [table] = first_look.sections(measured)
+    assert [row[0] for row in table.rows] == ["desk", "kitchen"] and "others" not in table.note
+    assert table.rows[0][1:7] == ["50,000", "2.30", "1.10", "2.00", "1.50", "1.00"]
+    measured["figures"]["load_average"] = 1.5
+    assert "others were using the machine" in first_look.sections(measured)[0].note
+
+
+def test_the_relay_passes_pages_on_and_counts_their_bytes(tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_bytes(b"x" * 100_000)
+    handler = partial(SimpleHTTPRequestHandler, directory=str(tmp_path))
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server, first_look.Relay(server.server_port) as relay:
+        for each in (server, relay):
+            Thread(target=each.serve_forever, daemon=True).start()
+        read = urlopen(f"http://127.0.0.1:{relay.server_address[1]}/page.html", timeout=20).read()
+        assert len(read) == 100_000 and 100_000 < relay.page_bytes < 101_000 and relay.data_bytes == 0
+        for each in (server, relay):
+            each.shutdown()

@@ -37,6 +37,7 @@ MATERIAL: dict[str, Any] = {
     "extensions": {UNLIT: {}},
 }
 TEXTURED = MATERIAL | {"pbrMetallicRoughness": MATERIAL["pbrMetallicRoughness"] | {"baseColorTexture": {"index": 0}}}
+LINEAR = {"magFilter": 9729, "minFilter": 9729}  # smaller copies of the texture would mix neighbouring charts
 
 
 def _glb(mesh: Mesh, note: str) -> bytes:
@@ -82,7 +83,8 @@ def _glb(mesh: Mesh, note: str) -> bytes:
         "buffers": [{"byteLength": starts[-1]}],
     }
     if texture is not None:
-        document |= {"images": [{"mimeType": "image/jpeg", "bufferView": views}], "textures": [{"source": 0}]}
+        image = {"mimeType": "image/jpeg", "bufferView": views}
+        document |= {"images": [image], "samplers": [LINEAR], "textures": [{"source": 0, "sampler": 0}]}
     return _packed(document, b"".join(array.tobytes() + bytes(-array.nbytes % 4) for array in arrays))
 
 

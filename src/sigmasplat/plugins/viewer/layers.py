@@ -42,10 +42,9 @@ def shown(piece: Piece, unsure: bool) -> Tensor:
 
 def palette_range(pieces: Sequence[Piece], unsure: bool) -> tuple[float, float]:
     """Return the range of uncertainties that the palette covers, in equal ratios: that of nearly all shown splats."""
-    values = [uncertainties(piece)[shown(piece, unsure)].numpy() for piece in pieces]
-    if not sum(map(len, values)):
-        return 1.0, 2.0
-    low, high = np.quantile(np.concatenate(values), (0.02, 0.98))
+    shown_ones = (uncertainties(piece)[shown(piece, unsure)].numpy() for piece in pieces)
+    values = np.concatenate([np.empty(0, np.float32), *shown_ones])
+    low, high = np.quantile(values, (0.02, 0.98)) if len(values) else (1.0, 2.0)
     return max(float(low), 1e-9), float(high)
 
 
