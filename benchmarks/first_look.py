@@ -37,7 +37,7 @@ from headless_browser import CHROMIUM, Page, chromium, wait_for
 arg = tyro.conf.arg
 HOST = "127.0.0.1"
 DESKTOP, PHONE = (1280, 800), (390, 844)
-DRAG_S, BUSY = 4.0, 0.5
+DRAG_S, BUSY = 5.0, 0.5
 """How long the mouse drags; the load per core above which the figures are not those of an idle machine."""
 SPY = """
 (() => {
