@@ -54,7 +54,7 @@ def splat_arrays(piece: Piece, span: tuple[float, float] | None, unsure: bool) -
     chosen = field_without_moments(piece.field.params[mask], {})
     if span is not None:
         values = np.log(uncertainties(piece)[mask].clamp(min=span[0]).numpy())
-        colors = colormap.apply(values, *np.log(span), colormap.INFERNO)
+        colors = colormap.apply(values, float(np.log(span[0])), float(np.log(span[1])), colormap.INFERNO)
     else:
         colors = np.asarray((chosen.colors.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8))
     spread = covariances(chosen.quats.numpy(), chosen.scales.numpy())
