@@ -140,6 +140,12 @@ PAGES = {
                 "Tracking with the paths of the pose gradient that CG-SLAM's code leaves out.",
                 ("Sequences",),
             ),
+            Shown(
+                "what-variance-is-good-for",
+                "Poses in known maps, colour weighed by variances and by an oracle; σ² learned in several ways.",
+                ("Recordings and room", "Room with mirrors", "Ways to learn σ²"),
+                ("NLL, best factor", "oracle, depth too"),
+            ),
         ),
         first="verdicts",
     ),
