@@ -144,7 +144,7 @@ PAGES = {
                 "what-variance-is-good-for",
                 "Poses in known maps, colour weighed by variances and by an oracle; σ² learned in several ways.",
                 ("Recordings and room", "Room with mirrors", "Ways to learn σ²"),
-                ("NLL, best factor", "oracle, depth too"),
+                ("NLL, best factor",),
             ),
         ),
         first="verdicts",

@@ -38,8 +38,8 @@ class Options:
     )  # fmt: skip
     width: Annotated[int, arg(help="working width, pixels")] = 160
     seeds: Annotated[tuple[int, ...], arg(help="windows of each source, 0 to 4, or rooms")] = (0, 1, 2, 3, 4)
-    iterations: Annotated[int, arg(help="steps a keyframe; 3 times for the first, 4 times for all at the end")] = 30
-    refit: Annotated[int, arg(help="steps of each refit of σ²")] = 150
+    iterations: Annotated[int, arg(help="steps a keyframe; 3 times for the first, 4 times for all at the end")] = 20
+    refit: Annotated[int, arg(help="steps of each refit of σ²")] = 60
     quick: Annotated[bool, arg(help="a minute: a room, one seed, small; no results written")] = False
     name: Annotated[str, arg(help="name of the results")] = "what-variance-is-good-for"
     fresh: Annotated[bool, arg(help="repeat windows that exist already")] = False

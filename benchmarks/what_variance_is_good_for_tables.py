@@ -40,17 +40,12 @@ def change(windows: Windows, condition: str, weights: str, against: str) -> floa
 
 
 def interval(values: Sequence[float]) -> str:
-    """Write the mean of clusters and its 95 % interval (Student's t)."""
+    """Write the mean of clusters and half of its 95 % interval (Student's t), as one word."""
     mean = float(np.mean(values))
     if len(values) < 2:
-        return signed(mean)
+        return f"{mean:+.0f}"
     half = float(student.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / math.sqrt(len(values)))
-    return f"{signed(mean)} [{signed(mean - half)}, {signed(mean + half)}]"
-
-
-def signed(value: float) -> str:
-    """Write a share in % with its sign."""
-    return f"{value:+.0f}" if round(value) else "0"
+    return f"{mean:+.0f}±{half:.0f}"
 
 
 def changes(title: str, windows: Windows, by: Cluster, note: str) -> Section:
@@ -84,7 +79,7 @@ def paired(windows: Windows) -> Section:
 
 
 def learned(windows: Windows) -> Section:
-    """Tabulate the scores of every way to learn σ²: means over sources; "as trained": of their first windows."""
+    """Tabulate the scores of every way to learn σ²: means over sources; "as trained": of their last windows."""
     rows = []
     for name in dict.fromkeys(name for window in windows for name in window["sigma"]):
         having = [window for window in windows if name in window["sigma"]]
@@ -93,7 +88,7 @@ def learned(windows: Windows) -> Section:
         for score in SCORES:
             means = [float(np.mean([window["sigma"][name][score] for window in group])) for group in groups]
             factor = 100.0 if score == "share" else 1.0
-            deviation = f" ± {factor * np.std(means, ddof=1):.2f}" if len(means) > 1 else ""
+            deviation = f"±{factor * np.std(means, ddof=1):.2g}" if len(means) > 1 else ""
             cells.append(f"{factor * np.mean(means):.2f}{deviation}")
         rows.append([name, *cells])
     note = "Held-out frames at true poses; mean ± standard deviation over sources. r²: squared error of colour."
@@ -105,7 +100,7 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     windows = measured["figures"]["windows"]
     plain = [window for window in windows if window["source"] != MIRRORS]
     mirrors = [window for window in windows if window["source"] == MIRRORS]
-    note = "Change of the position error, %: mean and 95 % interval, clustered by {}; negative is better."
+    note = "Change of the position error, %: mean ± half of its 95 % interval, clustered by {}; negative is better."
     made = []
     if plain:
         made.append(changes("Recordings and room", plain, lambda w: w["source"], note.format("source")))

@@ -27,7 +27,7 @@ SMOOTH_PX = 3.0
 """The oracle's squared residual is averaged over this radius (σ of a Gaussian): a variance, not one error."""
 MOST_STEPS, REWEIGHTED = 5, 4
 """Gauss–Newton steps, and solutions of reweighted least squares in each. V is rendered anew in each step."""
-DIFFERENCE, NEAR, CONVERGED, FARTHEST = 1e-3, 2e-3, 5e-5, 0.02
+DIFFERENCE, NEAR, CONVERGED, FARTHEST = 1e-3, 2e-3, 2e-4, 0.02
 """Of twists about a point at the median depth, m and rad: for derivatives, the distance at which they are used, the
 last step, the longest step."""
 LEAST_COLOR, LEAST_M = 0.002, 0.001
@@ -36,13 +36,12 @@ LEAST_COLOR, LEAST_M = 0.002, 0.001
 
 class Weigh(NamedTuple):
     """A way to weigh pixels: a variance, τ, and the largest weight; likelihood: by 1/σ of colour and of depth instead,
-    without λ_c, τ and limits; depth_too: depth by its own squared residual; constant: one σ for the whole image."""
+    without λ_c, τ and limits; constant: one σ for the whole image."""
 
     by: str
     tau: float = 1.0
     most: float = 3.0
     likelihood: bool = False
-    depth_too: bool = False
     constant: bool = False
 
 
@@ -56,7 +55,6 @@ WEIGHTS = {
     REAL: Weigh("σ²"),
     ORACLE: Weigh("oracle"),
     EACH_PIXEL: Weigh("pixel", most=30.0),
-    "oracle, depth too": Weigh("oracle", depth_too=True),
     ONE_SIGMA: Weigh("σ²", likelihood=True, constant=True),
     REAL_LIKELIHOOD: Weigh("σ²", likelihood=True),
     ORACLE_LIKELIHOOD: Weigh("oracle", likelihood=True),
@@ -82,6 +80,11 @@ class Pose:
         self.window, self.params = window, field.params
         self.view, self.view_V = window.view(False), window.view()
         self.derivatives = list[tuple[Matrix, Tensor]]()
+        camera = self.view.camera
+        v, u = np.indices((camera.height, camera.width))
+        chessboard = torch.from_numpy(np.flatnonzero(np.broadcast_to((u + v) % 2 == 0, (4, *u.shape))))
+        self.used = chessboard
+        self.least = torch.tensor([LEAST_COLOR] * 3 + [LEAST_M]).repeat_interleave(u.size)[chessboard]
         self.rows = {
             "V": with_sigma(field.params, sigmas["text"]),
             "σ²": with_sigma(field.params, closed_form(window, field, (0, 1, 1)), alone=True),
@@ -105,8 +108,8 @@ class Pose:
         """Return the T_camera_map that minimises the tracking loss of VarSplat §3, from a guess, by Gauss–Newton.
 
         The render is linearised by differences, and the sum of absolute errors minimised by reweighted least squares:
-        this finds the minimum itself, where Adam with its fixed rates would scatter about it. Colour is used where the
-        map is opaque, also without a depth reading.
+        this finds the minimum itself, where Adam with its fixed rates would scatter about it. Every second pixel is
+        used, as on a chessboard; colour where the map is opaque, also without a depth reading.
         """
         middle = np.eye(4)
         middle[2, 3] = float(live.target.depth_image[live.target.depth_image > 0].median())
@@ -140,10 +143,7 @@ class Pose:
             on_color, on_depth = (planes[:3] + LEAST_COLOR**2).rsqrt(), (planes[3:] + LEAST_M**2).rsqrt()
             share = max(1.0 - weight_color, LEAST_COLOR)  # cancels the weights of `_step`
             return torch.stack([3.0 / weight_color * on_color, on_depth.expand(3, -1, -1) / share])
-        on_color, on_depth = weighed(planes[:3], mask, weigh), torch.ones(3, h, w)
-        if weigh.depth_too:
-            on_depth = weighed(planes[3:].expand(3, -1, -1), mask & (live.target.depth_image > 0), weigh)
-        return torch.stack([on_color, on_depth])
+        return torch.stack([weighed(planes[:3], mask, weigh), torch.ones(3, h, w)])
 
     def _step(self, live: Live, T: Matrix, weight_color: float, weights: Tensor, middle: Matrix) -> Matrix:
         """Return the twist [6] of the camera about a point `middle` on its axis that minimises the linearised loss."""
@@ -153,12 +153,10 @@ class Pose:
         share = opaque * alpha**ALPHA_POWER
         on_color = weight_color / 3.0 * share * weights[0]
         on_depth = (1.0 - weight_color) * share * outlier_mask(r[3], opaque & read, OUTLIER) * weights[1, :1]
-        weight = torch.cat([on_color, on_depth]).reshape(-1)
-        flat = r.reshape(-1)
-        least = torch.tensor([LEAST_COLOR, LEAST_COLOR, LEAST_COLOR, LEAST_M]).repeat_interleave(r[0].numel())
+        weight, flat = (x.reshape(-1)[self.used] for x in (torch.cat([on_color, on_depth]), r))
         twist = torch.zeros(6)
         for _ in range(REWEIGHTED):
-            weighted = J * (weight / ((flat + twist @ J).abs() + least))
+            weighted = J * (weight / ((flat + twist @ J).abs() + self.least))
             H = (weighted @ J.T).double()
             twist = -torch.linalg.solve(
                 H + 1e-9 * H.diagonal().mean() * torch.eye(6), (weighted @ flat).double()
@@ -166,13 +164,13 @@ class Pose:
         return twist.double().numpy()
 
     def _derivative(self, live: Live, T: Matrix, middle: Matrix, r: Tensor) -> Tensor:
-        """Return the derivative [6, 4 H W] of the residuals r by the twist, at T or at a pose very near."""
+        """Return the derivative [6, n] of the used residuals by the twist, at T or at a pose very near."""
         back = se3.inverse(middle)
         for T_known, J in self.derivatives:
             if np.abs(se3.log(back @ T @ se3.inverse(T_known) @ middle)).max() < NEAR:
                 return J
         moved = (middle @ se3.exp(DIFFERENCE * unit) @ back @ T for unit in np.eye(6))
-        J = torch.stack([(self._off(live, T_moved)[0] - r) / DIFFERENCE for T_moved in moved]).reshape(6, -1)
+        J = torch.stack([(self._off(live, T_moved)[0] - r).reshape(-1)[self.used] / DIFFERENCE for T_moved in moved])
         self.derivatives.append((T, J))
         return J
 
