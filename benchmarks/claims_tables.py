@@ -185,7 +185,7 @@ def lists(folder: Path = record.RESULTS) -> str:
         for paper, claims in PAPERS.items():
             for judgement, word in verdicts.items():
                 said = [
-                    claim.said + (f" ({shown})" if (shown := effect(found)) != "–" else "")
+                    claim.said + (f" ({shown})" if (shown := effect(found)) != "–" and judgement != UNCLEAR else "")
                     for claim, (found_judgement, found) in ((claim, judged(claim, folder)) for claim in claims)
                     if found_judgement == judgement
                 ]

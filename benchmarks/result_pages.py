@@ -130,21 +130,10 @@ PAGES = {
         "Claims of the papers and weights by uncertainty",
         (
             Shown(
-                "ablation",
-                "VarSplat's uses of σ², added one by one.",
-                ("Verdicts",),
-            ),
-            Shown("weights", "Other uses of an uncertainty, each against the run without it.", ("Verdicts",)),
-            Shown(
-                "pose-gradient",
-                "Tracking with the paths of the pose gradient that CG-SLAM's code leaves out.",
-                ("Sequences",),
-            ),
-            Shown(
                 "what-variance-is-good-for",
                 "Poses in known maps, colour weighed by variances and by an oracle; σ² learned in several ways.",
-                ("Recordings and room", "Room with mirrors", "Ways to learn σ²"),
-                ("NLL, best factor",),
+                ("Recordings and room", "Ways to learn σ²"),
+                ("NLL, best factor", "V, τ 3"),
             ),
         ),
         first="verdicts",

@@ -41,10 +41,15 @@ class Options:
     iterations: Annotated[int, arg(help="steps a keyframe; 3 times for the first, 4 times for all at the end")] = 20
     refit: Annotated[int, arg(help="steps of each refit of σ²")] = 60
     quick: Annotated[bool, arg(help="a minute: a room, one seed, small; no results written")] = False
+    collect: Annotated[bool, arg(help="measure nothing; write the results of the windows that are done")] = False
     name: Annotated[str, arg(help="name of the results")] = "what-variance-is-good-for"
     fresh: Annotated[bool, arg(help="repeat windows that exist already")] = False
     runs: Annotated[Path, arg(help="folder of the windows that are done")] = RUNS
     out: Annotated[Path, arg(help="folder of the results")] = record.RESULTS
+
+    def file_of(self, source: str, seed: int) -> Path:
+        """Return the file of a window."""
+        return self.runs / f"{record.slug(f'{source} {seed} {self.width} {self.iterations}')}.json"
 
 
 def measure_window(options: Options, source: str, seed: int) -> dict[str, Any]:
@@ -66,7 +71,9 @@ def measure(options: Options) -> dict[str, Any]:
     found = []
     for seed in options.seeds:
         for source in options.sources:
-            kept = options.runs / f"{record.slug(f'{source} {seed} {options.width} {options.iterations}')}.json"
+            kept = options.file_of(source, seed)
+            if options.collect and not kept.is_file():
+                continue
             if options.fresh or options.quick or not kept.is_file():
                 clock = time.process_time()
                 made = measure_window(options, source, seed)
@@ -85,6 +92,9 @@ def main(options: Options) -> int:
     """Measure, write the results, print them; return the exit code."""
     if options.quick:
         options = replace(options, sources=(ROOM, MIRRORS), seeds=(0,), width=96, iterations=15, refit=60)
+    if options.collect:
+        done = [seed for seed in options.seeds if any(options.file_of(s, seed).is_file() for s in options.sources)]
+        options = replace(options, seeds=tuple(done))
     return program.run("what_variance_is_good_for", options, measure, options.seeds, not options.quick)
 
 

@@ -59,6 +59,7 @@ def changes(title: str, windows: Windows, by: Cluster, note: str) -> Section:
     for name in (REAL_LIKELIHOOD, ORACLE_LIKELIHOOD):
         cells = [interval([change(g, c, name, ONE_SIGMA) for g in groups]) for c in CONDITIONS]
         rows.append([f"{name}, against {ONE_SIGMA}", *cells])
+    note += f" {len(windows)} windows, {len(errors(windows, next(iter(CONDITIONS)), NONE))} frames."
     return Section(title, ["weights", *CONDITIONS], rows, note)
 
 
@@ -72,7 +73,7 @@ def paired(windows: Windows) -> Section:
             for name in WEIGHTS:
                 if name != NONE:
                     off = np.array(errors(group, condition, name)) - before
-                    cells.append(f"{off.mean():+.2f} ± {off.std(ddof=1) / math.sqrt(len(off)):.2f}")
+                    cells.append(f"{off.mean():+.2f} ± {off.std(ddof=len(off) > 1) / math.sqrt(len(off)):.2f}")
             rows.append([group[0]["source"], condition, str(len(before)), *cells])
     head = ["source", "condition", "frames", f"{NONE}, mm", *(name for name in WEIGHTS if name != NONE)]
     return Section("Paired differences, mm", head, rows, "Mean ± standard error over frames, weights − none.")

@@ -16,6 +16,7 @@ from sigmasplat.config.find_preset import preset as preset_of
 from sigmasplat.config.text import override
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
+from sigmasplat.errors import SourceError
 from sigmasplat.fit.losses import NLL_EPS
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.input.source import Source
@@ -96,7 +97,19 @@ class Window:
         spacing = FAST_SPACING if self.source in FAST else SPACING
         span = (KEYFRAMES - 1) * spacing
         start = self.seed % WINDOWS * (len(self.sequence) - 1 - span) // (WINDOWS - 1)
-        return [start + k * spacing for k in range(KEYFRAMES)]
+        return [self._first_with_truth(start, span) + k * spacing for k in range(KEYFRAMES)]
+
+    def _first_with_truth(self, start: int, span: int) -> int:
+        """Return the first frame from `start` on where it and the next `span` frames have a true pose; `start`
+        if there is none."""
+        for first in range(start, len(self.sequence) - span):
+            try:
+                for i in range(first, first + span + 1):
+                    self.sequence.pose(i)
+            except SourceError:
+                continue
+            return first
+        return start
 
     @property
     def between(self) -> list[int]:

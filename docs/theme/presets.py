@@ -17,17 +17,15 @@ SOURCES: dict[str, dict[str, Any]] = tomllib.loads((Path(__file__).parent / "sou
 FAMILIES = ("varsplat", "varsplat-released", "cgslam", "cgslam-released")
 HEAD = """# Values of the papers' presets
 
-Each paper has two families of presets. `varsplat-DATASET` and `cgslam-DATASET` are the text with its supplement; what
-it leaves open is the released code's. `varsplat-released-SCENE` and `cgslam-released-SCENE` are the released code, with
-the values of each scene from one table (`plugins/presets/scenes/`). Nothing of ours is on in any of them.
+`varsplat-DATASET` and `cgslam-DATASET` are the text with its supplement; what it leaves open is the released code's.
+`varsplat-released-SCENE` and `cgslam-released-SCENE` are the released code, with the values of each scene
+(`plugins/presets/scenes/`); their rows say what differs from the text's. `loopsplat-DATASET` is `varsplat-DATASET`
+without any use of σ².
 
-A row of a released family says what differs from the text's row above. *text*: the paper with its supplement;
-*supplement*: a table of it; *code*: the released code, and its file; *ours*: neither states a value. A part of a source
-may name the data sets that it is for. `loopsplat-DATASET` is `varsplat-DATASET` without any use of σ².
-
-Generated from [`sources.toml`](theme/sources.toml) by `docs/theme/presets.py`. Settings that are not listed have
-[their defaults](settings.md). Differences in method: [VarSplat](varsplat.md#deviations),
-[CG-SLAM](cgslam.md#deviations).
+*text*: the paper with its supplement; *supplement*: a table of it; *code*: a file of the released code; *ours*: neither
+states a value. Settings that are not listed have [their defaults](settings.md). Differences in method:
+[VarSplat](varsplat.md#deviations), [CG-SLAM](cgslam.md#deviations). Generated from
+[`sources.toml`](theme/sources.toml) by `docs/theme/presets.py`.
 
 """
 OFF = """
