@@ -100,11 +100,11 @@ def refined_fx(config: Config, camera: Camera) -> float | None:
 def score_full_resolution(
     scoring: ViewScoring, config: Config, recorded: bool, progress: Progress = api.no_progress
 ) -> dict[str, Any] | None:
-    """Score the chosen views and the test views at the size of the recording if `recorded`, else at that of the final
-    map's last stage; None without that stage.
+    """Score the chosen views and the test views at the size of the recording if `recorded`, else views that were not
+    fitted at that of the final map's last stage; None without that stage.
 
-    Returns width, height, and the keys of the scores at working resolution: training, held_out, both in their submaps,
-    and test_views. Calls `progress(done, total)` with the chosen views.
+    Returns width, height, and the keys of the scores at working resolution: training (None unless `recorded`),
+    held_out, both in their submaps, and test_views. Calls `progress(done, total)` with the chosen views.
     """
     width = scoring.source.camera.width if recorded else full_width(config, scoring.source.camera)
     if width is None:
@@ -112,7 +112,8 @@ def score_full_resolution(
     scale = width / (scoring.input.width or scoring.source.camera.width)
     settings = replace(scoring.input, width=width, crop_px=round(scoring.input.crop_px * scale))  # crops the same part
     camera = scoring.source.camera.prepared(settings.width, settings.crop_px)
-    unpredicted = replace(scoring, maps=replace(scoring.maps, predict=None))
+    chosen = {kind: views if recorded or kind != "training" else [] for kind, views in scoring.chosen.items()}
+    unpredicted = replace(scoring, chosen=chosen, maps=replace(scoring.maps, predict=None))
     scores = view_scores.kind_scores(*unpredicted.scores(settings, progress, None), scoring.maps)
     scores |= {"test_views": score_test_views(scoring, settings)}
     return {"width": camera.width, "height": camera.height} | scores
