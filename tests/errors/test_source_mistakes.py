@@ -144,6 +144,15 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
         "a pose that is not rigid": (with_text("pose/7.txt", SCALED_ROWS), ("7.txt", "not a rigid")),
         "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
     },
+    "scannet_preprocessed": {
+        "only colour": (without("depth"), (*LISTS, "depth/*.TIFF")),
+        "poses of a part": (with_text("gt_pose.txt", "1.0 0 0 0 0 0 0 1\n"), ("gt_pose.txt", "1 poses", "truncated")),
+        "a pose that is not rigid": (with_text("gt_pose.txt", "1.0 0 0 0 0 0 0 2\n" * 9), ("gt_pose.txt:1", "rigid")),
+        "a truncated matrix": (with_text("intrinsic.txt", "1170 0 647"), ("intrinsic.txt", "4×4")),
+        "other frames in depth": (renumbered("depth/*"), ("no number in common", "one recording")),
+        "images of another size": (resized("rgb/*.png", (40, 30)), ("40×30", "32×24", "register")),
+        "depth as a colour image": (painted("depth/*"), ("not a depth image",)),
+    },
     "scannetpp": {
         "images not undistorted": (without("dslr/undistorted_images"), ("no undistorted_images/", "dslr.undistort")),
         "depth of the fisheye": (rendered_elsewhere, ("no undistorted_depths/", "render_depth")),

@@ -158,11 +158,11 @@ def test_commands_of_the_advice_can_be_run(changes: dict, settings: dict, words:
     override(config, split_settings(value for flag, value in pairwise(given) if flag == "--set"))
 
 
-def test_after_a_good_run_the_advice_is_to_view_and_to_export() -> None:
+def test_after_a_good_run_the_advice_is_to_view_and_to_share() -> None:
     assert advice(GOOD, RUN, SETTINGS) == []
     commands = [shlex.split(command) for _, command in next_commands("runs/my k")]
     assert [(words[1], words[2]) for words in commands] == [
-        ("view", "runs/my k"), ("export", "runs/my k"), ("mesh", "runs/my k"),
+        ("view", "runs/my k"), ("share", "runs/my k"), ("mesh", "runs/my k"),
     ]  # fmt: skip
 
 
