@@ -113,18 +113,21 @@ def _received(source: socket) -> bytes:
         return b""
 
 
+def show(page: Page, url: str, width: int, height: int) -> None:
+    """Open an address in a window of this size, and wait for its first picture."""
+    page.call("Page.enable")
+    page.call("Page.addScriptToEvaluateOnNewDocument", source=SPY)
+    page.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+    page.call("Page.navigate", url=url)
+    wait_for(lambda: bool(page.value("window.firstLook && firstLook.first_ms")))
+
+
 def opened(url: str, size: tuple[int, int]) -> dict[str, float]:
     """Open a page in a new Chromium; return the time to its first picture, and its frames per second under a drag."""
     width, height = size
     with TemporaryDirectory(prefix="first-look-") as profile, chromium("about:blank", Path(profile)) as port:
         page = Page(port)
-        page.call("Page.enable")
-        page.call("Page.addScriptToEvaluateOnNewDocument", source=SPY)
-        page.call(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
-        )  # fmt: skip
-        page.call("Page.navigate", url=url)
-        wait_for(lambda: bool(page.value("window.firstLook && firstLook.first_ms")))
+        show(page, url, width, height)
         time.sleep(2.0)  # what is loaded after the first picture does not count as movement
         return {"first_s": page.value("firstLook.first_ms") / 1000.0, "frames_per_s": dragged(page, width, height)}
 

@@ -15,7 +15,7 @@ from typing import Annotated
 import numpy as np
 import record
 import tyro
-from first_look import HOST, SPY
+from first_look import HOST, show
 from PIL import Image
 
 from sigmasplat.errors import SigmaSplatError
@@ -60,13 +60,7 @@ def halves(run: RunFolder) -> tuple[Pixels, Pixels]:
         viewer.show(finished_snapshot(run))
         with TemporaryDirectory(prefix="viewer-") as profile, chromium("about:blank", Path(profile)) as port:
             page = Page(port)
-            page.call("Page.enable")
-            page.call("Page.addScriptToEvaluateOnNewDocument", source=SPY)
-            page.call(
-                "Emulation.setDeviceMetricsOverride", width=WIDTH, height=HEIGHT, deviceScaleFactor=1, mobile=False
-            )  # fmt: skip
-            page.call("Page.navigate", url=f"http://{HOST}:{server.get_port()}")
-            wait_for(lambda: bool(page.value("window.firstLook && firstLook.first_ms")))
+            show(page, f"http://{HOST}:{server.get_port()}", WIDTH, HEIGHT)
             viewer.panel.floating.value = False
             page.value(NOTICE)
             own = settled(page)
