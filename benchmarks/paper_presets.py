@@ -1,7 +1,7 @@
 """Run the presets of both papers with their own numbers of iterations on real frames with several submaps (issue 18).
 
-Nothing is shortened: tracking, mapping, registration and the final map take all their steps. The images are 160 pixels
-wide, those of light presets 80, and the pixels cropped at each edge are scaled down too. Every 8th frame is held out.
+Nothing is shortened: tracking, mapping, registration and the final map take all their steps. The images are 320 pixels
+wide, those of light presets 160, and the pixels cropped at each edge are scaled down too. Every 8th frame is held out.
 `sigma`, the default, runs on the same frames. Writes benchmarks/results/paper-presets-<machine>.json and prints a table
 for each sequence; exit code 1 if a run failed.
 
@@ -29,7 +29,7 @@ PAPERS = (
     "cgslam-released-fr1-desk", "cgslam-released-replica", "cgslam-loops-tum",
     "loopsplat-tum", "sigma",
 )  # fmt: skip
-WIDTH_PX = 160
+WIDTH_PX = 320
 CAMERA_WIDTH_PX = 640
 """Width of the images of both sequences, to which the presets' cropped pixels refer."""
 HOLD_OUT = 8
@@ -42,7 +42,7 @@ class Options(accuracy.Options):
 
     sources: Annotated[tuple[str, ...], arg(help="sequences: names in the data folder, or paths")] = (
         "redkitchen",
-        "livingroom",
+        "fr1_xyz",
     )
     presets: Annotated[tuple[str, ...], arg(help="presets to run")] = PAPERS
     seeds: Annotated[tuple[int, ...], arg(help="random seeds, one run for each")] = (0,)
@@ -91,7 +91,7 @@ COLUMNS = (
 )
 """Title, name of the figure, factor to the unit of the title."""
 NOTE = (
-    "Numbers of iterations as in the preset, 160 pixels wide, NetVLAD's place taken by the built-in descriptor. Each "
+    "Numbers of iterations as in the preset, 320 pixels wide, NetVLAD's place taken by the built-in descriptor. Each "
     "process has one core. The presets were tuned on other recordings, at full size."
 )
 

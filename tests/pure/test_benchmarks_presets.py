@@ -70,14 +70,14 @@ def test_a_light_preset_runs_at_half_the_size_of_the_other() -> None:
     full, light = (
         override(preset(name), split_settings(paper_presets.sized(name))) for name in ("cgslam-tum", "cgslam-light-tum")
     )
-    assert (full.input.width, light.input.width) == (160, 80)
-    assert full == replace(light.changed(input={"width": 160}), name=full.name)
+    assert (full.input.width, light.input.width) == (320, 160)
+    assert full == replace(light.changed(input={"width": 320}), name=full.name)
 
     def result(name: str, width_px: int) -> dict[str, Any]:
         job = {"source": "kitchen", "preset": name, "settings": [f"input.width={width_px}"]}
         return {"job": job, "problem": None, "figures": {"frames": 120, "ate_m": 0.02}}
 
-    results = [result("cgslam-light-tum", 160), result("cgslam-light-replica", 80), result("cgslam-tum", 160)]
+    results = [result("cgslam-light-tum", 320), result("cgslam-light-replica", 160), result("cgslam-tum", 320)]
     shown = laid_out("paper_presets", {"jobs": results})["kitchen"]
     assert [row[0] for row in shown.rows] == [
         "cgslam-light-tum (not light: full size)", "cgslam-light-replica", "cgslam-tum",
