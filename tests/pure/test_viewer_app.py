@@ -15,6 +15,7 @@ import pytest
 import torch
 
 from room_map import poses, room, room_map
+from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.uncertainty.map_uncertainty import SHIPPED, Background, MapUncertainty, SplatStd
 
@@ -142,11 +143,12 @@ def turned(client: Any, opening: Opening) -> float:
 
 
 def test_a_browser_opens_at_the_best_view_and_floats_until_a_person_moves_it(app: ViewerApp, client: list[int]) -> None:
-    opening = Opening(poses()[1], 2.0, 0.8, np.array([0.0, -1.0, 0.0]))
+    opening = Opening(poses()[1], 2.0, Camera(40, 40, 50.0, 50.0, 19.5, 19.5), np.array([0.0, -1.0, 0.0]))
     app.show(Snapshot("room", EMPTY_PATH, Piece(None, room_map()), opening=opening))
     (page,) = app.server.get_clients().values()
     wait_until(lambda: bool(np.allclose(page.camera.position, opening.T_world_camera[:3, 3], atol=1e-6)))
-    assert page.camera.fov == pytest.approx(0.8)
+    wide = 2.0 * np.arctan(0.5 * 48 / 64 / 50.0 * 40)  # the window is 64×48: the whole width of the image
+    assert page.camera.fov == pytest.approx(wide) and opening.fov(0.25) > opening.fov(1.0)
     np.testing.assert_allclose(app.server.initial_camera.position, opening.T_world_camera[:3, 3])
     wait_until(lambda: turned(page, opening) > 0.3)
     assert not app.panel.path.value, "nothing is drawn over the first look"

@@ -133,7 +133,7 @@ class ViewerApp:
         elif len(inside):
             move_camera(self.server.initial_camera, inside[-1], BACK_M, UP_M)
         for client in self.server.get_clients().values() if first else ():
-            go_to_start(client, self.server.initial_camera)
+            go_to_start(client, self.server.initial_camera, snapshot.opening)
 
     def _draw_path(self, snapshot: Snapshot) -> None:
         path, row, shown = snapshot.path, self.panel.row.value, self.panel.path.value
@@ -228,7 +228,7 @@ class ViewerApp:
     def _welcome(self, client: viser.ClientHandle) -> None:
         client.camera.on_update(lambda _: self.changed() if self.panel.layer else None)  # the browser draws the rest
         if self._snapshot is not None:
-            go_to_start(client, self.server.initial_camera)
+            go_to_start(client, self.server.initial_camera, self._snapshot.opening)
         self.changed()
 
     def _clicked(self, row: int, client: viser.ClientHandle) -> None:

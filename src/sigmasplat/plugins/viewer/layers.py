@@ -163,8 +163,9 @@ def draw_legend(legend: Legend) -> colormap.Rgb:
     image.paste(Image.fromarray(colour_bar(legend.palette, width, LEGEND_BAR)), (0, 0))
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(14)
     middle = (height + LEGEND_BAR) // 2
-    draw.text((1, middle), f"{legend.low:.3g}{legend.unit}", INK, font, anchor="lm")
-    draw.text((width - 1, middle), f"{legend.high:.3g}{legend.unit}", INK, font, anchor="rm")
+    factor, unit = (100.0, " cm") if legend.unit == " m" and legend.high < 1.0 else (1.0, legend.unit)
+    draw.text((1, middle), f"{factor * legend.low:.2g}{unit}", INK, font, anchor="lm")
+    draw.text((width - 1, middle), f"{factor * legend.high:.2g}{unit}", INK, font, anchor="rm")
     return np.asarray(image)
 
 

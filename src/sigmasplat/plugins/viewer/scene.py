@@ -69,7 +69,7 @@ class ViserScene:
         """Let browsers that are opened later begin with a view; the first one says where up is."""
         if first:
             self.server.scene.set_up_direction(opening.up)
-        self.server.initial_camera.fov = opening.fov
+        self.server.initial_camera.fov = opening.fov(opening.camera.width / opening.camera.height)
         move_camera(self.server.initial_camera, opening.T_world_camera, ahead_m=opening.ahead_m)
 
     def show_current_camera(self, camera: Camera, T_world_camera: Matrix | None) -> None:
@@ -118,10 +118,11 @@ def move_camera(
     camera.look_at = (T_world_camera @ np.array([0.0, 0.0, ahead_m, 1.0]))[:3]
 
 
-def go_to_start(client: viser.ClientHandle, start: viser.InitialCameraConfig) -> None:
+def go_to_start(client: viser.ClientHandle, start: viser.InitialCameraConfig, opening: Opening | None) -> None:
     """Move a browser to where it should have opened: it may have reported another camera before it knew."""
     with client.atomic():
-        client.camera.fov, client.camera.position, client.camera.look_at = start.fov, start.position, start.look_at
+        client.camera.fov = start.fov if opening is None else opening.fov(client.camera.aspect)
+        client.camera.position, client.camera.look_at = start.position, start.look_at
 
 
 def camera_pose(camera: viser.CameraHandle) -> Matrix:

@@ -81,13 +81,19 @@ class CameraPath:
 
 
 class Opening(NamedTuple):
-    """What a browser sees first: its camera's pose [4, 4], the distance m of the point that it looks at, its vertical
-    field of view (rad), and the unit vector [3] that points up."""
+    """What a browser sees first: its camera's pose [4, 4], the distance m of the point that it looks at, the camera
+    whose image it shows, and the unit vector [3] that points up."""
 
     T_world_camera: Matrix
     ahead_m: float
-    fov: float
+    camera: Camera
     up: Matrix
+
+    def fov(self, aspect: float) -> float:
+        """Return the vertical field of view, rad, of a window with this ratio of width to height. A wide window shows
+        the whole width of the image and nothing beside it; a tall one is between the whole image and a full window."""
+        wider = aspect * self.camera.height / self.camera.width
+        return 2.0 * float(np.arctan(0.5 * self.camera.height / self.camera.fy / max(wider, wider**0.5)))
 
 
 EMPTY_PATH = CameraPath(np.empty((0, 4, 4)), np.empty(0, np.bool_), np.empty(0, np.int64), ())

@@ -75,7 +75,7 @@ def opening(piece: Piece, path: api.Trajectory, camera: Camera, config: api.Conf
         return None
     T, points = samples[best := best_view(samples)].T_world_camera, samples[best].points
     ahead_m = float(np.median((points - T[:3, 3]) @ T[:3, 2]))
-    return Opening(T, ahead_m, 2.0 * float(np.arctan(0.5 * camera.height / camera.fy)), T_floor_world[2, :3])
+    return Opening(T, ahead_m, camera, T_floor_world[2, :3])
 
 
 class SubmapCache:

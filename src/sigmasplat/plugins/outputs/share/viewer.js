@@ -209,8 +209,11 @@ const held = new Set(), pointers = new Map();
 const say = (text) => Object.assign(byId("hint"), { textContent: text, hidden: !text });
 const wanted = () => `${axesOf(cam)[2]} ${shownCount()}`;
 
-// The field of view is between the whole image of a keyframe and a full window.
-const fit = () => place({ focal: scene.focal * Math.sqrt((innerWidth / scene.width) * (innerHeight / scene.height)) });
+// A wide window shows the whole width of a keyframe's image, a tall one something between the image and a full window.
+const fit = () => {
+  const [x, y] = [innerWidth / scene.width, innerHeight / scene.height];
+  place({ focal: scene.focal * Math.max(x, Math.sqrt(x * y)) });
+};
 
 function aim() { // turn about the surface in the middle, and come nearer to it
   const hit = pick(innerWidth / 2, innerHeight / 2);
