@@ -248,7 +248,7 @@ from sigmasplat.registry import (
     SourceFormat as SourceFormat,
 )
 from sigmasplat.render import FieldRenderer as FieldRenderer, Render as Render, reference as reference, render as render
-from sigmasplat.render.backend import backend_module as backend_module, make_view as make_view
+from sigmasplat.render.backend import automatic as automatic, make_view as make_view
 from sigmasplat.render.kernels import (
     blend_with as blend_with,
     pose_gradient as pose_gradient,
@@ -256,6 +256,7 @@ from sigmasplat.render.kernels import (
     view_params as view_params,
 )
 from sigmasplat.render.render import as_refined as as_refined
+from sigmasplat.render.self_test import kernel_speed as kernel_speed, self_test as self_test
 from sigmasplat.render.view import Layers as Layers, View as View
 from sigmasplat.run.callbacks import Callback as Callback
 from sigmasplat.run.figures import format_ranges as format_ranges, number as number, rate as rate

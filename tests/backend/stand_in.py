@@ -25,6 +25,7 @@ import sigmasplat
 from emulated_cuda import FLAGS, HERE, Emulator
 from sigmasplat.plugins.cuda import launch as cuda_launch
 from sigmasplat.plugins.cuda.launch import Argument
+from sigmasplat.render.backend import automatic
 
 DEVICE, HOST = torch.device("cuda", 0), torch.device("cpu")
 SCALARS = {
@@ -323,8 +324,10 @@ def standing_in(emulator: Emulator, library: Any) -> Iterator[StandIn]:
         patch.setattr(torch, "tensor", _made_there(torch.tensor))
         patch.setattr(torch, "as_tensor", _made_there(torch.as_tensor))
         library.say_that_cuda_is_there(True)
+        automatic.cache_clear()
         try:
             with device:
                 yield device
         finally:
+            automatic.cache_clear()
             library.say_that_cuda_is_there(False)

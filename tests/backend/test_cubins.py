@@ -11,7 +11,7 @@ from cuda_kernels import ARCHITECTURES, kernel_names
 from sigmasplat.errors import BackendError
 from sigmasplat.plugins.cuda import cubins
 
-pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[gpu]'")
+pytest.importorskip("cuda.bindings.nvrtc", reason="cuda-bindings is not installed: pip install 'sigmasplat[cuda]'")
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 sys.path.append(str(BENCHMARKS))

@@ -19,8 +19,8 @@ from sigmasplat.plugins.cuda.launch import THREADS, Device
 from splat_scenes import gradients, scene
 
 # Both before a test puts another driver in its place, or the import of one would put it back.
-pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[gpu]'")
-pytest.importorskip("cuda.bindings.nvrtc", reason="needs pip install 'sigmasplat[gpu]'")
+pytest.importorskip("cuda.bindings.driver", reason="needs pip install 'sigmasplat[cuda]'")
+pytest.importorskip("cuda.bindings.nvrtc", reason="needs pip install 'sigmasplat[cuda]'")
 bindings = pytest.importorskip("cuda.bindings")
 CONTEXT, ORDINAL, STREAM = "the context of device 3", 3, 5
 

@@ -79,7 +79,7 @@ def test_python_versions_are_listed_in_order() -> None:
 def test_all_contains_every_extra_and_each_is_documented() -> None:
     (whole,) = EXTRAS["all"]
     named = set(re.fullmatch(r"sigmasplat\[([\w,]+)\]", whole)[1].split(","))
-    assert named == set(EXTRAS) - {"all", "dev", "docs", "gpu"}, "gpu is 200 MB for NVIDIA devices only"
+    assert named == set(EXTRAS) - {"all", "dev", "docs", "cuda"}, "cuda is 200 MB for NVIDIA devices only"
     table = (ROOT / "docs" / "install.md").read_text(encoding="utf-8").partition("## Extras")[2].partition("\n## ")[0]
     assert set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)) == set(EXTRAS)
 

@@ -214,9 +214,12 @@ def _run_and_score(
     from sigmasplat.plugins.checks.motion import MotionWatch
     from sigmasplat.plugins.sources.live import Arrivals, LiveSource
     from sigmasplat.realtime.system import RealTime
+    from sigmasplat.render.backend import why_of
     from sigmasplat.run.resume import StateFile
     from sigmasplat.run.session import Session
 
+    if why := why_of(start.slam.config.backend):
+        screen.say(why)
     state = StateFile(start.slam, folder, run_options.save_every)
     read = Arrivals(source) if realtime else source
     system = RealTime(start.slam, covariances=False, should_stop=read.hurries) if isinstance(read, Arrivals) else None

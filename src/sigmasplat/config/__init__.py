@@ -37,8 +37,8 @@ class Config:
     seed: Count = 0
     """Seed of all random numbers. Runs with other seeds show how much a result depends on chance."""
     backend: str = "auto"
-    """Renderer: auto = the value of SIGMASPLAT_BACKEND if it is set, else cpu; cuda needs an NVIDIA GPU; reference is
-    slow plain torch, which defines the kernels; or the name of a plug-in."""
+    """Renderer: auto = the value of SIGMASPLAT_BACKEND if it is set, else a GPU whose self-test passes, else cpu; cuda
+    needs an NVIDIA GPU; reference is slow plain torch, which defines the kernels; or the name of a plug-in."""
     input: InputConfig = field(default_factory=InputConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
     seeding: SeedConfig = field(default_factory=SeedConfig)

@@ -4,8 +4,9 @@ Only this module and the table of the fits (fit/backends.py) choose by device. T
 view gets here. Other devices are plug-ins (`registry.Backend`), CUDA among them.
 """
 
+from functools import cache
 from types import ModuleType
-from typing import cast
+from typing import NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from sigmasplat.data.field import COLUMNS, GaussianField, Rows
 from sigmasplat.errors import BackendError
 from sigmasplat.registry import Backend, named, rows
 from sigmasplat.render import cpu, reference
+from sigmasplat.render.self_test import self_test
 from sigmasplat.render.view import View
 
 CHANNELS = 3
@@ -35,15 +37,46 @@ def backend_row(name: str) -> Backend | None:
     return None if name in OWN else cast(Backend, named((Backend,), name))
 
 
+class Automatic(NamedTuple):
+    """What "auto" stands for: the name of a backend, and one line that says why; empty where there is no device."""
+
+    name: str = "cpu"
+    why: str = ""
+
+
+@cache
+def automatic() -> Automatic:
+    """Return the backend of a device of this machine whose self-test passes, else that of the CPU."""
+    tried = Automatic()
+    for row in rows(Backend) if torch.cuda.is_available() else ():  # no plug-in is loaded where there is no device
+        if row.device is None:
+            continue
+        try:
+            device, found = row.device(), self_test(row.view)
+        except BackendError as problem:
+            tried = Automatic(why=f"computing on the CPU, because {problem}")
+            continue
+        if found.ok:
+            passed = f"computing on {device}, whose self-test passed; SIGMASPLAT_BACKEND=cpu turns it off"
+            return Automatic(row.name, passed)
+        tried = Automatic(why=f"computing on the CPU, because the self-test of {device} failed: {found}")
+    return tried
+
+
+def why_of(asked: str) -> str:
+    """Return the line of `automatic` if it decides which backend is used for a requested one, else nothing."""
+    return automatic().why if asked == env.switches().backend == "auto" else ""
+
+
 def backend_name(asked: str, device: torch.device | None = None) -> str:
     """Return the name of the backend that is used for a requested one.
 
     "auto" means the value of SIGMASPLAT_BACKEND if it is set, else the kernels of the device that holds the tensors,
-    else those of the CPU. Raises BackendError if the name is unknown.
+    else what `automatic` finds. Raises BackendError if the name is unknown.
     """
     name = env.switches().backend if asked == "auto" else asked
     if name == "auto":
-        return "cpu" if device is None or device.type == "cpu" else device.type
+        return automatic().name if device is None or device.type == "cpu" else device.type
     if name not in OWN and name not in backend_names():
         raise BackendError(f"unknown backend {name!r} (known: auto, {', '.join(backend_names())})")
     return name

@@ -2,17 +2,13 @@
 
 import os
 import platform
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module, metadata
 from typing import Any
 
-from sigmasplat.api import BackendError, env, machine
-
-MAX_DIFFERENCE = 1e-2
-"""If rounding moves a splat across the threshold alpha_min, a pixel can change by up to 1/255."""
-MEAN_DIFFERENCE = 1e-4
+from sigmasplat.api import BackendError, automatic, env, kernel_speed, machine, make_view, self_test
 
 
 @dataclass(frozen=True)
@@ -36,7 +32,7 @@ def check_installation() -> Iterator[Finding]:
     native = check_kernels()
     yield native
     if native.ok:
-        yield self_test()
+        yield from check_backend("cpu")
     yield from check_cuda()
 
 
@@ -86,60 +82,24 @@ def check_cuda() -> Iterator[Finding]:
     if missing:
         yield Finding("CUDA", f"not available: {missing}")
         return
-    yield check_driver(cubins.compiler_version())
     for index in range(torch.cuda.device_count()):
         device = torch.device("cuda", index)
         about = torch.cuda.get_device_properties(device)
         architecture = cubins.architecture_of((about.major, about.minor))
         yield Finding(str(device), f"{about.name}, {architecture}, {about.total_memory / 2**30:.0f} GiB")
-        try:
-            yield self_test(device)
-        except BackendError as problem:
-            yield Finding("self-test", str(problem), False)
+        with torch.cuda.device(device):
+            yield from check_backend("cuda")
+    yield Finding("backend auto", automatic().why)
 
 
-def check_driver(compiler: str) -> Finding:
-    """Compare the versions of driver and compiler: the driver must have the same major version, or a newer one."""
-    from cuda.bindings import driver
-
-    from sigmasplat.plugins.cuda import cubins
-
-    version = driver.cuDriverGetVersion()[1]
-    enough = version // 1000 >= int(compiler.split(".")[0])
-    advice = "" if enough else f"; too old for NVRTC {compiler}: update it, or {cubins.INSTALL_OLDER}"
-    return Finding("CUDA driver", f"for CUDA {version // 1000}.{version % 1000 // 10}{advice}", enough)
-
-
-def self_test(device: Any = "cpu") -> Finding:
-    """Render 300 splats with the kernels of a device and with the reference renderer, and compare the images."""
-    import torch
-
-    from sigmasplat.api import backend_module, reference
-
-    started_s = time.perf_counter()
-    name = "cpu" if str(device) == "cpu" else "cuda"
-    with torch.no_grad():
-        ours, expected = _picture(backend_module(name), device).cpu(), _picture(reference)
-    difference = (ours - expected).abs()
-    largest, mean = float(difference.max()), float(difference.mean())
-    ok = bool(torch.isfinite(ours).all()) and largest < MAX_DIFFERENCE and mean < MEAN_DIFFERENCE
-    seconds = time.perf_counter() - started_s
-    return Finding("self-test", f"largest difference {largest:.1e}, mean {mean:.1e} ({seconds:.2f} s)", ok)
-
-
-def _picture(backend: Any, device: Any = "cpu") -> Any:
-    """Render a fixed random cloud of splats: colour and alpha, [H, W, 4]."""
-    import torch
-
-    from sigmasplat.api import Camera, RenderConfig
-
-    random = torch.Generator().manual_seed(0)
-    means, shapes, quats, colors = (torch.rand(300, n, generator=random).to(device) for n in (3, 3, 4, 3))
-    camera, options = Camera(64, 48, 60.0, 60.0, 31.5, 23.5), RenderConfig(depth="center")
-    means = (means - 0.5) * means.new_tensor([3.0, 2.0, 2.0]) + means.new_tensor([0.0, 0.0, 2.0])
-    seen = backend.project(means, quats - 0.5, 0.01 + 0.1 * shapes, torch.eye(4), camera, options)
-    blended = backend.blend(*seen[:4], 0.2 + 0.7 * colors[:, 0], colors, None, camera, options)
-    return torch.cat([blended.sums, blended.alpha[..., None]], -1)
+def check_backend(name: str) -> Iterator[Finding]:
+    """Compare a backend with the definition in plain torch, and measure it."""
+    try:
+        found = self_test(make := partial(make_view, name))
+        yield Finding("self-test", str(found), found.ok)
+        yield Finding("speed", kernel_speed(make))
+    except BackendError as problem:
+        yield Finding("self-test", str(problem), False)
 
 
 def _version(name: str) -> str:

@@ -26,7 +26,7 @@ ALIGNING = -1
 RAYS = (-4, -7)
 """The same for the programs of views with `render.depth=ray`: their feature counts, negative."""
 PROGRAMS = (ALIGNING, FITTING, *FEATURE_COUNTS, *RAYS)
-INSTALL = install_extra("gpu")
+INSTALL = install_extra("cuda")
 INSTALL_OLDER = "pip install 'cuda-bindings<13' nvidia-cuda-nvrtc-cu12"
 """For drivers that support only CUDA 12."""
 

@@ -162,10 +162,16 @@ def missing() -> str | None:
     if not torch.cuda.is_available():
         return "torch finds no CUDA device; check that a GPU and its driver are installed"
     try:
-        cubins.compiler_version()
+        compiler = cubins.compiler_version()
     except BackendError as problem:
         return f"{problem}"
-    return None
+    from cuda.bindings import driver
+
+    version = driver.cuDriverGetVersion()[1]
+    if version // 1000 >= int(compiler.split(".")[0]):
+        return None
+    old = f"the driver is for CUDA {version // 1000}.{version % 1000 // 10}, too old for NVRTC {compiler}"
+    return f"{old}; update it, or {cubins.INSTALL_OLDER}"
 
 
 def refuse_where_missing() -> None:
