@@ -267,10 +267,14 @@ def test_what_is_written_is_read_as_from_the_host(device: torch.device, tmp_path
 
 
 @pytest.mark.slow
-def test_a_run_is_written_and_evaluated(device: torch.device, tmp_path: Path) -> None:
-    settings = QUICK | {"backend": "cuda", "input.width": "32", "input.limit": "4"}
+def test_a_run_takes_the_device_and_says_so(
+    device: torch.device, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = QUICK | {"input.width": "32", "input.limit": "4"}
     words = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
     with pytest.raises(SystemExit, match="0"):
         cli.main(["run", "synthetic:frames=200,width=32,height=24", "--out", str(tmp_path / "run"), *words])
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"metrics.json", "map.ply", "checkpoint.safetensors"} <= written
+    said = capsys.readouterr()
+    assert "computing on cuda:0, whose self-test passed" in said.out + said.err
