@@ -14,7 +14,8 @@ from sigmasplat.types import Matrix
 
 @dataclass(frozen=True)
 class Camera:
-    """An undistorted pinhole: image size in pixels, focal lengths and principal point in pixels."""
+    """An undistorted pinhole: image size in pixels, focal lengths and principal point in pixels. Raises ConfigError
+    for numbers that no camera has: an angle of view above 179.8°, or below 0.2", or a centre that far outside."""
 
     width: int
     height: int
@@ -24,9 +25,9 @@ class Camera:
     cy: float
 
     def __post_init__(self) -> None:
-        numbers = (self.fx, self.fy, self.cx, self.cy)
-        if self.width < 1 or self.height < 1 or not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
-            raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive and finite)")
+        both = (self.width, self.fx, self.cx), (self.height, self.fy, self.cy)
+        if not all(n >= 1 and 1e-3 * n <= f <= 1e6 * n and abs(c) <= 1e6 * n for n, f, c in both):
+            raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive, all within reason)")
 
     @property
     def width_rad(self) -> float:
