@@ -136,9 +136,15 @@ def parse_json(text: str | bytes, where: object, error: type[SigmaSplatError] = 
     import json  # here, because every command imports this module
 
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as problem:  # ValueError: not UTF-8, or a whole number of 4300 digits, too
+        return json.loads(text, parse_int=_whole_number)
+    except (ValueError, RecursionError) as problem:  # ValueError: not UTF-8, too
         raise error(f"{where}: not readable as JSON ({cause(problem)}); correct it") from problem
+
+
+def _whole_number(digits: str) -> int:
+    if len(digits) > 308:  # no float is as large
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)
 
 
 def read_json(path: Path, error: type[SigmaSplatError] = SourceError, most: int = MOST_JSON_BYTES) -> Any:
