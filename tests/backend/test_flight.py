@@ -35,6 +35,7 @@ def packed(archive: Path) -> dict[str, bytes]:
         return {m.name.removeprefix("./"): files.extractfile(m).read() for m in files if m.isfile()}  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(cuda_launch.missing() is None, reason="there is a CUDA device: fly")
 def test_the_whole_flight_is_rehearsed(emulator: Emulator, tmp_path: Path) -> None:
     done = fly("--rehearse", OUT=tmp_path, REHEARSAL=emulator.folder, PATIENCE=10)
