@@ -16,12 +16,13 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "settings.md"
 HEAD = """# Settings
 
-`--set SECTION.NAME=VALUE` changes a setting of `demo`, `run`, `inspect` and `bench`. The `config.json` of a run holds
-all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m` metres, `_deg` degrees,
-`_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. § is a heading of
-[varsplat.md](varsplat.md) or [cgslam.md](cgslam.md). "Ours" marks what is in neither paper. *Takes* is the type and
-the valid range. *Changed by* names the systems with another value in some preset. A run is refused if a value is out of
-range, infinite or not a number; the error names all of them.
+`--set SECTION.NAME=VALUE` changes a setting of a command that reads a recording, of `demo` or of `bench`. The
+`config.json` of a run has all settings that it used. The defaults are the preset `sigma`. Units are in the names: `_m`
+metres, `_deg` degrees, `_px` pixels, `_s` seconds. `lr_` is a learning rate, `weight_` the weight of a loss. § is a
+heading of [varsplat.md](varsplat.md) or [cgslam.md](cgslam.md). "Ours" marks what is in neither paper. *Takes* is the
+type and the valid range; `on` and `off` mean `true` and `false`. *Changed by* names the presets with another value
+(*all*: cgslam, loopsplat and varsplat; [which value](paper-values.md)). Names of this form that are not listed here,
+such as `tracking.lost_share`, are fixed values. A value out of range is refused.
 
 Generated from [`config/`](../src/sigmasplat/config/) by `docs/theme/settings.py`. Back to the [README](../README.md).
 """
@@ -40,21 +41,21 @@ def classes() -> dict[str, ast.ClassDef]:
 
 
 def changed_by(section: str, name: str) -> str:
-    """Return the systems whose presets have another value than the default."""
+    """Return the systems of which a preset has another value than the default; "all" for all of them."""
     values = {system: [getattr(getattr(c, section), name) for c in configs] for system, configs in presets().items()}
     default = values.pop("sigma")[0]
-    return ", ".join(system for system, found in values.items() if any(value != default for value in found))
+    changed = [system for system, found in values.items() if any(value != default for value in found)]
+    return "all" if len(changed) == len(values) else ", ".join(changed)
 
 
 @cache
 def presets() -> dict[str, list[Any]]:
-    """Return the settings of all presets by system: the first word of the name, or two for released code."""
+    """Return the settings of all presets by system, the first word of the name."""
     from sigmasplat.config.find_preset import list_presets, preset, presets_by_scene
 
     found: dict[str, list[Any]] = {}
     for name in [*list_presets(), *presets_by_scene()]:
-        system, _, rest = name.partition("-")
-        found.setdefault(f"{system}-released" if rest.startswith("released") else system, []).append(preset(name))
+        found.setdefault(name.partition("-")[0], []).append(preset(name))
     return found
 
 
@@ -113,8 +114,9 @@ def _words(kind: Any) -> str:
     base, range_ = unpacked(kind)
     if choices := get_args(base):  # Literal["a", "b"]
         return ", ".join(f"`{choice}`" for choice in choices)
-    name = {int: "whole number", float: "number", bool: "`true`, `false`", str: "text"}[base]
-    return f"{name}, {range_}" if range_ else name
+    name = {int: "integer", float: "number", bool: "`true`, `false`", str: "text"}[base]
+    words = str(range_ or "").replace("between ", "").replace(" and ", " to ").replace("at least", "≥")
+    return f"{name} {words.replace('above', '>').replace('finite', '')}".strip()
 
 
 def _written(value: Any) -> str:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.run.terminal import Screen
 
-DataFolder = Annotated[str | None, arg("ROOT", "folder of the sequences", "")]
+DataFolder = Annotated[str | None, arg("ROOT", "folder that contains the recordings", "")]
 Jobs = Annotated[From1, arg("N", "number of runs at the same time")]
 BatchFolder = Annotated[Path | None, arg("DIR", "folder of the results; finished runs in it are kept", "")]
 ReplaceRuns = Annotated[bool, flag("replace runs in DIR that have other settings or other code")]
@@ -42,7 +42,9 @@ def batch(
 ) -> int:  # fmt: skip
     """Run SLAM on many recordings, each in a run folder in DIR (default: runs/batch), and score them.
 
-    Finished runs are kept, stopped ones resume. example: sigmasplat batch data/kitchen data/hall --jobs 2
+    Finished runs are kept, stopped ones resume; exit code 1 if a run failed.
+
+    example: sigmasplat batch data/kitchen data/hall --jobs 2
     """
     from sigmasplat.plugins.batch.batch import Batch
     from sigmasplat.plugins.batch.job import Job
@@ -66,7 +68,7 @@ def batch(
 
 
 def bench(
-    what: Annotated[Literal["table"], tyro.conf.Positional, arg("table", "what to make")],
+    what: Annotated[Literal["table"], tyro.conf.Positional, arg("table", "always the word `table`")],
     table: Annotated[
         str, tyro.conf.Positional,
         arg("TABLE", "name of the table, path of a definition (.toml), or `list` to list all tables"),
@@ -81,9 +83,9 @@ def bench(
 ) -> int:  # fmt: skip
     """Make the table of a paper: scenes × systems × seeds, with the published numbers beside ours.
 
-    Finished runs are kept, stopped ones resume. Missing scenes are listed, and the others are run.
+    Finished runs are kept, stopped ones resume. Missing scenes are listed, others run; exit code 1 if one fails.
 
-    example: sigmasplat bench table list
+    example: sigmasplat bench table list; then: sigmasplat bench table NAME --data data/tum
     """
     from sigmasplat.plugins.presets.table_files import list_tables, read_table
 

@@ -24,7 +24,7 @@ class ExportOptions:
         "M", "keep only splats whose surface has a standard deviation of depth below M metres (depth_std_m, "
         "docs/exports.md); needs a run with uncertainty.json", "(default: all)",
     )] = None  # fmt: skip
-    uncertain: Annotated[bool, flag("also show splats that are uncertain")] = False
+    uncertain: Annotated[bool, flag("show in a video also the splats that are uncertain")] = False
     axes: Annotated[Literal["y-up", "z-up", "y-down", "camera"] | None, arg(
         "{y-up,z-up,y-down,camera}", "axes of a map: y-up, z-up and y-down are levelled; camera: those of the run's "
         "path; SPZ: only y-up and camera", "(default: y-up for SPZ, y-down for PLY)",

@@ -60,7 +60,9 @@ def calibrate(
     """Measure a camera from a recording in which it moves: when it reads depth and rows (rolling shutter), and what is
     wrong with its stated focal length, image centre, depth and brightness.
 
-    A run with this file corrects its images from the first one on. example: sigmasplat calibrate data/kitchen
+    A run with --set input.calibrate=FILE corrects its images from the first one on.
+
+    example: sigmasplat calibrate data/kitchen --out kinect.json
     """
     from sigmasplat.data.camera_errors import sensor_said
     from sigmasplat.files.atomic import replacing

@@ -38,9 +38,9 @@ SourcePath = Annotated[
 Runs = Annotated[From1, arg("N", "number of runs of each sequence, with seeds 0 to N − 1")]
 Overwrite = Annotated[bool, flag("replace an earlier result")]
 SaveEvery = Annotated[float, Range(0), arg("S", "save the state for `resume` every S seconds; 0 = at the end only")]
-RealTime = Annotated[bool, arg(None, "replay a recording at its own times, and track it in real time")]
+RealTime = Annotated[bool, flag("replay a recording at its own times, and track it in real time")]
 View = Annotated[bool, flag("show the run in the browser while it runs, and afterwards until Ctrl-C")]
-Host = Annotated[str, arg("ADDRESS", "address that viewer and stream listen on; the default allows this machine only")]
+Host = Annotated[str, arg("ADDRESS", "address that the viewer listens on; the default allows this machine only")]
 Port = Annotated[
     int, Range(0, 65535), arg("N", "port of the viewer; if it is busy, the next free one is used; 0 = any")
 ]

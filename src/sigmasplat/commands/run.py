@@ -61,7 +61,9 @@ def run(
     """Run SLAM on a sequence, or on a camera until Ctrl-C: trajectory, map, uncertainty, report.
 
     example: sigmasplat run data/kitchen --limit 200 --set input.width=480
+
     for robots: sigmasplat run data/kitchen --bag kitchen-bag
+
     with plug-ins of yours: sigmasplat run data/kitchen --plugin my.py --set input.filters=my-mask
     """
     from sigmasplat.run.finished_map import FinishedMap, continue_map
@@ -98,7 +100,9 @@ def resume(
 ) -> int:  # fmt: skip
     """Resume a run that was stopped or killed, from its last saved state.
 
-    The result has the same bytes as an uninterrupted run. example: sigmasplat resume runs/kitchen-sigma
+    The result has the same bytes as an uninterrupted run.
+
+    example: sigmasplat resume runs/kitchen-sigma
     """
     from sigmasplat.run.resume import resume as resumed
     from sigmasplat.run.terminal import Screen

@@ -69,17 +69,17 @@ class FinalConfig(Section, name="final"):
     """Number of refinement steps over all keyframes; 0 = no refinement."""
     move_poses: bool = True
     """Whether keyframes, and with them frames, move at the end (ours); off = the path stays the tracked one (paper).
-    First the graph of keyframes moves them (`loops`), then refinement: by about half the median standard deviation of
-    their positions at most, from 1 mm to 1 cm."""
+    First their graph moves them, then refinement, by about half the median standard deviation of their positions at
+    most, 1 mm to 1 cm."""
     seconds: NotNegative = 0.0
     """Time budget of the refinement in seconds: it ends at the latest then, even if steps are left, and learning rates
     fall in time. The result then depends on the speed of the machine. 0 = no limit."""
     schedule: Literal["steady", "falling", "epochs"] = "epochs"
     """How refinement runs. steady: keyframes drawn for each of many steps at the rates of mapping (paper); falling: the
-    same with a rate of positions that falls to 1.6e-6 m (VarSplat's code); epochs: every keyframe once, in random
-    order, before any is used again, for few steps at rates that fall, without U, without hidden splats, with limits on
-    the shapes of splats, with the exposure of each keyframe, a gain and an offset for each channel, fitted too, and
-    from a map that keeps the splats of one submap in voxels of 5 cm instead of 2 cm (ours)."""
+    same with a rate of positions that falls to 1.6e-6 m (VarSplat's code); epochs (ours, docs/final-map.md): every
+    keyframe once, in random order, before any is used again; few steps at rates that fall, without U and without hidden
+    splats; limits on the shapes of splats; a fitted exposure for each keyframe; merging in voxels of 5 cm instead of
+    2 cm."""
     sh_degree: Annotated[int, Range(0, 3)] = 3
     """Degree of view-dependent colour reached during refinement, 0 to 3."""
     spacing_m: ClassVar[float] = 0.02
@@ -90,9 +90,9 @@ class FinalConfig(Section, name="final"):
     """Splats with at most this opacity, 0 to 1, are removed during refinement."""
     width: Annotated[int, WIDTHS_PX] = 640  # a phone's photo has ten times as many pixels, and costs ten times as much
     """Width of the images in the last stage of refinement in pixels, at most the recorded width, so that 8192 is the
-    camera's; 0 = no such stage, only working images are used (papers). If it is above `input.width`, the colour of each
-    keyframe is kept at this size, and as many steps as `iterations` follow; with a time budget they go on until it
-    ends. Two thirds of them use working images, so that the map stays sharp at that size too."""
+    camera's; 0 = no such stage (papers). If it is above `input.width`, the colour of each keyframe is kept at this
+    size, and `iterations` more steps follow; with a time budget they go on until it ends. Two thirds of them use
+    working images, so that the map stays sharp at that size too."""
     uncertainty: bool = True
     """Whether variance is used to merge submaps and still learned during refinement; off = paper."""
 

@@ -172,14 +172,14 @@ class InputConfig(Section, name="input"):
     sensor: Literal[
         "auto", "generic", "kinect-v1", "realsense-stereo", "lidar-iphone", "time-of-flight", "rendered"
     ] = "auto"
-    """Model of the standard deviation of depth readings: that of a sensor (`config.input`); generic = the law of
+    """Model of the standard deviation of depth readings: that of a sensor (docs/data.md); generic = the law of
     `render.depth_noise_per_m`; rendered = the same law, with an exact calibration and exact times; auto = that of the
     sensor if the source knows it, otherwise generic."""
     calibrate: str = "auto"
-    """When the sensor reads depth and rows (rolling shutter), which is corrected: auto = measured from keyframes that
-    are aligned to each other, but not for rendered images, nor for predicted or stereo depth; off = not known; or the
-    path of a file with these times, and what is wrong with the stated camera, which `sigmasplat calibrate` has written.
-    Its numbers replace the path in a run's settings."""
+    """Correction of when the sensor reads depth and rows (rolling shutter): auto = times measured from keyframes that
+    are aligned to each other, but not for rendered images, nor for predicted or stereo depth; off = none; or the path
+    of a file of `sigmasplat calibrate`, with times and errors of the stated camera. A run's settings hold the numbers
+    of the file."""
     denoise_depth: bool = True
     """Whether depth images that are noisier than those of a structured-light sensor are smoothed."""
 

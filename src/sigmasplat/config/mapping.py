@@ -25,8 +25,8 @@ class RenderConfig(Section, name="render"):
     """Depth of a splat at a pixel: center = that of its centre (papers); ray = where the ray meets it most densely, so
     that a flat splat can show a slanted surface (RaDe-GS)."""
     scene_scale: Above0 = 1.0
-    """Size of the scene relative to a room. Fixed limits in metres, such as the gates of alignment, are multiplied by
-    it. `run` sets it for stereo recordings, together with all settings that are lengths (`config.scale.scaled`)."""
+    """Size of the scene relative to a room: factor on fixed limits in metres, such as the gates of alignment. `run`
+    sets it for stereo recordings, together with all settings that are lengths."""
     depth_noise_per_m: Above0 = 0.003
     """Standard deviation of depth readings z is assumed to be this times z², per metre. 0.003 is a structured-light
     sensor (Khoshelham & Elberink 2012). `run` sets σ_d/(f·b) for stereo recordings."""
@@ -92,9 +92,8 @@ class SeedConfig(Section, name="seeding"):
     shape: Literal["neighbours", "neighbours-behind", "pixel", "disc"] = "disc"
     """Shape and size of seeds: neighbours = spheres, as large as the root mean squared distance to the 3 nearest splats
     (papers); neighbours-behind = the same, 0.5 % farther than the reading (VarSplat's code); pixel = fewer and more
-    opaque spheres, 0.8 times as large as a pixel at that depth × the spacing of the seeds; disc = the same 0.65 times
-    as large, as discs on the surface that the depth image shows, wider where they are seen at an angle and a tenth as
-    thick."""
+    opaque spheres, of 0.8 × a pixel at that depth × the spacing of the seeds; disc = the same with 0.65, as discs on
+    the surface that the depth image shows, a tenth as thick, and wider where they are seen at an angle."""
     outliers: Literal["keep", "remove", "remove-later"] = "keep"
     """Whether seeds far from their 40 nearest neighbours are removed; remove-later = not from the seeds of an empty map
     (VarSplat's code)."""
@@ -156,7 +155,7 @@ class MappingConfig(Section, name="mapping"):
     """A frame becomes a keyframe this many frames after the last keyframe."""
     overlap_below: NotNegative = 0.75  # more keyframes when the camera moves fast
     """A frame also becomes a keyframe if its overlap with the newest keyframe is below this, or if the image has moved
-    by an eighth of its width; 0 = off."""
+    by an eighth of its width; 0 = neither."""
     iterations: Count = 8  # the final map is as good as with 15; the submaps have up to 1 dB less
     """Optimisation steps per keyframe: the first setting to change to trade speed for quality."""
     first_iterations: Count = 80  # the rendered depth has no bias from here on; without D̂/A it takes 150
@@ -164,11 +163,10 @@ class MappingConfig(Section, name="mapping"):
     with `weight_mean_depth` until about 75."""
     divided: bool = True
     """Whether the steps of a keyframe, and the search for the loops of finished submaps, are spread over frames, so
-    that no frame takes much longer than others; off = the frame that ends a submap makes the whole search. The first
-    half runs at the keyframe, the second half during the frames before the next keyframe. If mapping moves poses
-    (`lr_pose_*`), all steps run at the keyframe, because the next frames are tracked from these poses. The first
-    keyframe of a map runs `iterations` steps. Each frame after it runs `iterations` steps, or `first_iterations` / 15
-    if that is more, until `first_iterations` are done."""
+    that no frame takes much longer than others. Half of the steps run at the keyframe, half during the next frames; all
+    at the keyframe if mapping moves poses (`lr_pose_*`), from which the next frames are tracked. The first keyframe of
+    a map runs `iterations` steps, and each frame after it as many, but at least a 15th of `first_iterations`, until
+    these are done."""
     few_steps: bool = True
     """Whether rates and draws suit few steps per keyframe: σ² and opacities then change as much as with hundreds of
     steps, and older keyframes are drawn more often; off = papers."""

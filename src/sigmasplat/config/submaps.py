@@ -12,12 +12,12 @@ class SubmapConfig(Section, name="submaps"):
 
     distance_m: NotNegative = 0.5
     """A new submap starts if the camera is farther than this from the submap's first pose, or has rotated by more than
-    `angle_deg`; 0 = off. If all rules are off, the map is one submap."""
+    50°; 0 = off. If all rules are off, the map is one submap."""
     frames: Count = 0
     """A new submap starts this many frames after the first one of the active submap; 0 = off."""
     uncertainty_m: NotNegative = 0.02
     """A new submap starts if the standard deviation of the camera's position in the submap, accumulated from keyframe
-    to keyframe, exceeds this (`tracking.drift`); 0 = off."""
+    to keyframe, exceeds this; 0 = off."""
     inherit: bool = True  # starting a submap empty costs two seconds of first iterations
     """Whether a new submap starts with copies of the splats in view, which are then mapped like any others; off = it
     starts empty (paper)."""
@@ -114,10 +114,10 @@ class RegistrationConfig(Section, name="registration"):
     method: Literal["keyframe", "few-steps", "paper", "paper-fine", "code", "code-fine", "rendered"] = "keyframe"
     """How a keyframe is localised in the other submap. keyframe: against the map, and finally against the recorded
     image of the nearest keyframe there (ours), because the surfaces of a young map are biased; a loop that only the
-    maps show is rejected. The others use the pose relative to the map: few-steps = with small Adam steps; paper,
-    paper-fine = by the loss and the gate of VarSplat's text (eq. 18, 19), with its steps for real images and for
-    Replica; code, code-fine = as VarSplat's code: λ_c 0.95, colour only at pixels with much gradient, a gate with
-    limits; rendered = as code, with the image that its own submap renders (VarSplat's code for ScanNet)."""
+    maps show is rejected. The others are against the map alone: few-steps = with small Adam steps; paper, paper-fine =
+    by the loss and the gate of VarSplat's text (eq. 18, 19), with its steps for real images and for Replica; code,
+    code-fine = as VarSplat's code: λ_c 0.95, colour only at pixels with much gradient, a gate with limits; rendered =
+    as code, with the image that its own submap renders (VarSplat's code for ScanNet)."""
     exposure: ClassVar[bool] = True
     """Whether a factor and an offset of the colour are fitted too, because submaps may differ in exposure."""
     uncertainty: bool = True

@@ -34,8 +34,8 @@ class TrackingConfig(Section, name="tracking"):
     """Fit of camera poses: method, iterations, masks, weights (VarSplat §3; CG-SLAM §6)."""
 
     method: Literal["adam", "align"] = "align"  # Gauss–Newton on images instead of 200 renders per frame
-    """adam: gradient descent through the renderer, as in the papers; align: one render, then Gauss–Newton on that
-    image."""
+    """adam: gradient descent through the renderer, as in the papers; align: Gauss–Newton on the image of the newest
+    keyframe."""
     iterations: Count = 200
     """Maximum number of Adam steps per frame. Use more for fast or shaky motion, fewer for speed."""
     align_depth_by: Literal["V", "U"] = "V"
@@ -70,20 +70,20 @@ class TrackingConfig(Section, name="tracking"):
     outlier_factor: NotNegative = 50.0
     """Only pixels with a depth error below this multiple of its median are used; 0 = off."""
     restart: Literal["off", "longer", "odometry"] = "off"
-    """What `method` adam does where the loss at the first guess jumps: longer = twice the iterations, if it exceeds 5
-    times the median of the losses at which recent frames ended (VarSplat's code); odometry = the same from the motion
-    that aligning the last image gives, if it exceeds 50 times the median (VarSplat on ScanNet++)."""
+    """What `method` adam does if the loss at the first guess is above a multiple of the median loss at which recent
+    frames ended: longer = above 5, twice the iterations (VarSplat's code); odometry = above 50, the same from the
+    motion that aligning the last image gives (VarSplat on ScanNet++)."""
     exposure: bool = False
     """Whether a factor and an offset of the colour are fitted with the pose, for cameras that change their exposure."""
     lr_exposure: ClassVar[float] = 0.01
     """Learning rate of the exposure: change per step of the factor's logarithm and of the offset (colours 0 to 1)."""
     features: bool = True
-    """Whether sparse features give a second guess of the pose where the first fit is doubtful (ours). The same fit
-    starts from each guess, and the pose that is least likely wrong is used."""
+    """Whether sparse features give a second guess of the pose where the first fit is doubtful (ours); the pose that is
+    least likely wrong is used."""
     verify: bool = True
     """Whether a pose is judged by comparing surfaces at it (ours); off = by agreement and overlap only. It needs
-    `method` align. Alignment then uses the part of σ that depends on the distance, by the model of `input.sensor`,
-    instead of the law of `render.depth_noise_per_m`, also for loops and where a lost camera is searched for."""
+    `method` align, which then uses the part of σ that depends on the distance, by the model of `input.sensor`, instead
+    of `render.depth_noise_per_m`, also for loops and lost cameras."""
     fit_depth: bool = False
     """Whether the depth of each frame is fitted to the map and to other views before it is used, because its scale is
     arbitrary. `run` sets it for depth that a network predicted."""
@@ -161,8 +161,8 @@ class MovingConfig(Section, name="moving"):
 
     find: bool = True  # what it costs where nothing moves: benchmarks/search_cost.py
     """Whether keyframes are compared with each other: what one shows in space that another has seen to be free is
-    masked, and splats there are removed. Off = only what is nearer than the newest keyframe is masked, in tracking with
-    `tracking.verify` (papers: nothing)."""
+    masked, and splats there are removed. Off = with `tracking.verify` only what comes in front of the newest keyframe
+    is masked, else nothing (papers)."""
     still_frames: ClassVar[int] = 30
     """What was found to move and then stays in place for this many frames becomes part of the map again; 0 = never."""
     compared: ClassVar[int] = 3

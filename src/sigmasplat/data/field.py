@@ -101,7 +101,7 @@ class GaussianField(Rows):
     """N splats as one float32 tensor `params` [N, 17], columns named in `COLUMNS`.
 
     means: metres, world (or submap) frame; quats: wxyz, any positive norm; log_scales: log metres; opacity_logits:
-    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §3, s_i).
+    logit of opacity; colors: RGB in [0, 1]; log_variances: log σ² of observed colour about `colors` (VarSplat §1, s).
     `attributes` contains rows that only some maps need, by name (`ATTRIBUTES`). `ids` [N] int64 identify splats,
     whatever row they are in; `next_id` is the id of the next new splat.
     """

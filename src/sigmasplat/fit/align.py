@@ -1,7 +1,7 @@
 """Align two RGB-D images directly: Gauss–Newton on SE(3), coarse to fine, with gray and depth residuals together.
 
-The reference is a rendered map (tracking) or the previous frame (odometry). One render and a dozen steps of 0.1 ms
-replace dozens of renders. Alignment runs on the device that holds the images: the CPU or a CUDA device.
+The reference is a keyframe's image (tracking, the graph of keyframes), a rendered map, or the last frame (odometry).
+A dozen steps of 0.1 ms replace dozens of renders. Alignment runs on the device that holds the images: CPU or CUDA.
 """
 
 import math
@@ -213,7 +213,7 @@ def align(
     on each coarser level), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
     [0, 1] balances gray against depth, each in units of its Huber width. Each step also finds the gain of the live
-    image. With 0 iterations the guess stays, and is judged. Raises BackendError without the compiled kernels, or if
+    image. With 0 iterations the guess stays, and is judged. Raises BackendError if
     only one image is on a device.
     """
     if reference.kernels is not live.kernels:

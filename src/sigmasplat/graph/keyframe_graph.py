@@ -2,7 +2,7 @@
 
 Nodes are keyframes. Edges are relative poses with covariance: the hop from the keyframe before, closed loops, and
 direct alignments to earlier keyframes (Kerl et al., IROS 2013). The redundancy also measures how good the edges are:
-the variance of each kind of edge is multiplied by a factor that its residuals ask for (Förstner 1979).
+the variance of each kind of edge is multiplied by a factor that makes its residuals as large as stated (Förstner 1979).
 """
 
 from collections.abc import Callable, Iterable, Sequence

@@ -1,6 +1,6 @@
 // The maths of one splat: EWA projection and its derivative, templated on the number type (float, double, SIMD lanes).
 // Has no includes and no namespace: include it where the functions sqrt, max, clamp, ge, both, select and only of T are
-// declared. Notation: cg-slam.md §2.1. S is the scalar type of the camera's numbers.
+// declared. Notation: CG-SLAM §2.1. S is the scalar type of the camera's numbers.
 
 template <class S> struct View {          // pinhole + pose: p_camera = R · p_world + t
     S fx, fy, cx, cy;
@@ -109,7 +109,7 @@ inline __attribute__((always_inline)) void add_slopes(const View<S>& view, const
     f.slope_v = f.l2 * along + f.l3 * f.l3 * with_v;
 }
 
-// Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (cg-slam.md §2.1). The
+// Propagate a gradient on the footprint to the splat and, as a left twist (ρ, φ), to the pose (CG-SLAM §2.1). The
 // slopes depend on the pose by the path of the covariance. SLOPES: whether they have a gradient.
 template <bool SLOPES = false, class T, class S>
 inline __attribute__((always_inline)) void project_backward(
@@ -156,7 +156,7 @@ inline __attribute__((always_inline)) void project_backward(
     const auto free_x = both(ge(m.xn, m.xc), ge(m.xc, m.xn)), free_y = both(ge(m.yn, m.yc), ge(m.yc, m.yn));
     const T two = m.inv_z * S(0) + S(2), one = m.inv_z * S(0) + S(1);
     const T inv_z2 = m.inv_z * m.inv_z;
-    T cov[3];                              // h of §2.1
+    T cov[3];                              // h of CG-SLAM §2.1
     cov[0] = only(free_x, g_jx * view.fx * inv_z2);
     cov[1] = only(free_y, g_jy * view.fy * inv_z2);
     cov[2] = -((g_fxz * view.fx + g_fyz * view.fy) * inv_z2)

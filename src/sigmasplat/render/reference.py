@@ -37,7 +37,7 @@ def project(
     """Project splats to the image (EWA splatting, 3DGS eq. 5; CG-SLAM eq. 2).
 
     means [N, 3] m, world; quats [N, 4] wxyz, any norm; scales [N, 3] m, activated; T_camera_world [4, 4]. The pose
-    gradient is the sum of three paths: mean, covariance, depth (CG-SLAM spec §2.1). Without
+    gradient is the sum of three paths: mean, covariance, depth (CG-SLAM §2.1). Without
     `covariance_pose_gradient` the covariance has a constant pose.
     """
     T = T_camera_world.to(means)

@@ -1,4 +1,4 @@
-"""Render a field from a camera: two kernels, then formulas on their sums (DESIGN §3)."""
+"""Render a field from a camera: two kernels, then formulas on their sums."""
 
 from collections import deque
 from dataclasses import dataclass

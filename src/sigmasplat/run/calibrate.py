@@ -121,8 +121,8 @@ BOTH = Parameters(
 
 
 def _times_beside_camera(pairs: Sequence[Pair], alone: Fit) -> SensorTimes:
-    """Return the times where times and camera together agree best: they pull at each other. Those that were measured
-    alone if both are not clear."""
+    """Return the times where times and camera together agree best, because they bias each other; those that were
+    measured alone if both together are not clear."""
     if not alone.sure:
         return SensorTimes()
     even = CameraErrors(falloff=falloff_of(pairs, np.zeros(4))[0])
@@ -134,9 +134,9 @@ def _times_beside_camera(pairs: Sequence[Pair], alone: Fit) -> SensorTimes:
 def camera_errors(pairs: Sequence[Pair], times: SensorTimes) -> CameraErrors:
     """Measure what is wrong with the stated camera; unknown with few pairs.
 
-    Fall-off comes first, because it pulls at the others, and once more at the end. Errors are used if they are sure
-    (`sensor_fit`), and if those that each half of the pairs asks for lower the cost of the other half: an error of
-    another kind, which this camera cannot have, seldom does.
+    Fall-off is measured first, because it biases the others, and once more at the end. Errors are used if they are sure
+    (`sensor_fit`), and if those measured on each half of the pairs lower the cost of the other half: an error of
+    another kind seldom does.
     """
     seen, values = list[Pair](), np.zeros(4)
     for pair in pairs[:: len(pairs) // CAMERA_PAIRS + 1]:

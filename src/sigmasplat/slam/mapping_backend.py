@@ -34,7 +34,7 @@ submap that waits (`mapping.divided`). A slice is one alignment."""
 SAME = 1e-9
 """Keyframes whose poses differ by less are copies of one, which two submaps share."""
 LAST_TRIES = 3
-"""Number of keyframes per submap that is apart with which other components are searched at the end."""
+"""At the end, other components are searched with this many keyframes of each submap that is apart."""
 
 
 class MappingBackend(SlamState):

@@ -18,8 +18,8 @@ MOVED = 0.125
 
 
 def is_mappable(tracker: Tracker, recovery: Recovery) -> bool:
-    """Return whether the pose of the frame tracked last is certain enough to map the frame: a doubtful one is more
-    likely right than wrong, and without it the next frames may find nothing that they share with the map."""
+    """Return whether the frame tracked last may be mapped: it is not lost, and tracking is steady. A doubtful one may:
+    its pose is more likely right than wrong, and the next frames need the map there."""
     return not tracker.lost and recovery.is_steady
 
 

@@ -35,8 +35,7 @@ class Tracker:
     prior: that of the last frame; lost: tracking of the last frame failed; doubtful: number of frames in a row whose
     best pose the images contradict (`_doubts`); front: what was in front of the scene in the last frame, None if
     there was nothing or the frame was lost; keyframe_front: the same for the newest keyframe; detector: of moving
-    things; depth: the fit of predicted depth; started: a frame was tracked; times: of the sensor. Raises
-    ConfigError on settings that do not fit together.
+    things; depth: the fit of predicted depth; started: a frame was tracked; times: of the sensor.
     """
 
     config: TrackingConfig

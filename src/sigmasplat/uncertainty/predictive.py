@@ -2,7 +2,7 @@
 
 Published variances leave parts out: V (VarSplat) and U (CG-SLAM) are 0 where the map is empty. Here the light that no
 splat explains has a mean and a variance too, and the weights of the parts are fitted to views that the map has not seen
-(`fit.calibration`).
+(`uncertainty.calibration`).
 
 Values of splats are blended beside their colours, and values of pixels summed over each splat, with the same weights:
 w_ip of splat i at pixel p is that of the render, Ĉ_p = Σ_i w_ip c_i.

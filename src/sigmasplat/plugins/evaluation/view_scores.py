@@ -125,7 +125,7 @@ class MapSources:
     predict: predicts the variances of views of the final map; None if it was not measured how sure the map is.
     T_submap_camera [F, 4, 4]: the pose of each frame in its submap, which differs from the pose in the world if the
     refinement of the final map has moved keyframes; None: it follows from the pose in the world.
-    exposures [F, 3, 2]: those of the frames relative to the final map (`model.exposure`); None: not fitted.
+    exposures [F, 3, 2]: those of the frames relative to the final map (`data.camera.exposed`); None: not fitted.
     """
 
     final: GaussianField

@@ -144,7 +144,7 @@ def _page(source: ExportSource, target: Path, *, up: "Edge") -> str:
 
 PLUGIN = (
     Output("ply", (".ply",), "3DGS PLY with σ², for every viewer", _ply),
-    Output("spz", (".spz",), "Niantic's SPZ, less than a fifth of the size", _spz),
+    Output("spz", (".spz",), "Niantic's SPZ, an eighth of the size", _spz),
     Output("trajectory", (".txt",), "the path as TUM text", _trajectory),
     Output("covariance", (".cov.txt",), "the path as TUM text with the covariance of each pose", _covariance),
     Output("colmap", ("-colmap",), "a folder with COLMAP's text model in sparse/0", _colmap),

@@ -1,6 +1,6 @@
 """Presets of VarSplat and LoopSplat: what the text says; the released code is in `released_code`.
 
-`varsplat-*` follow VarSplat (arXiv 2603.09673) §2–3 and its supplement. `loopsplat-*` are the same without any
+`varsplat-*` follow the paper (arXiv 2603.09673) and its supplement. `loopsplat-*` are the same without any
 uncertainty weight, which is the front end of LoopSplat (arXiv 2408.10154). `*-fast` are ours, sized for two CPU cores.
 The values are in `values/varsplat.toml`; where each one comes from: docs/paper-values.md.
 """

@@ -146,5 +146,5 @@ class DynamicDetector:
         return replace(self, recent=recent)
 
     def cleared(self) -> "DynamicDetector":
-        """Return the watch with nothing remembered."""
+        """Return the detector with nothing remembered."""
         return DynamicDetector(self.config)

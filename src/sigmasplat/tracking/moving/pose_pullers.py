@@ -1,4 +1,4 @@
-"""Find the thing that has pulled a pose: the rest of the image asks for another one, by more than its errors explain.
+"""Find the thing that has pulled a pose: the rest of the image gives another pose, further away than errors explain.
 
 Both tests are those of a misfit that only part of the data has (Hausman 1978). Before a fit: at the pose that all
 pixels agree on, the gradient of the rest is not 0 (a score test). After it: the pose fitted without the thing is
