@@ -19,6 +19,7 @@ from every_preset import with_submaps
 from tables import Section
 
 from sigmasplat.config.find_preset import preset as preset_of
+from sigmasplat.config.text import split_settings
 from sigmasplat.errors import SigmaSplatError
 from sigmasplat.run_folder.runs import RunFolder
 
@@ -75,6 +76,11 @@ def with_times(job: accuracy.Job, result: dict[str, Any], options: Options) -> d
     return result | {"figures": result["figures"] | more}
 
 
+def width_of(result: dict[str, Any]) -> int:
+    """Return how wide the images of a run were, pixels."""
+    return int(split_settings(result["job"]["settings"])["input.width"])
+
+
 COLUMNS = (
     ("lost", "lost", 1.0),
     ("silently off", "silent", 1.0),
@@ -91,8 +97,8 @@ COLUMNS = (
 )
 """Title, name of the figure, factor to the unit of the title."""
 NOTE = (
-    "Numbers of iterations as in the preset, 320 pixels wide, NetVLAD's place taken by the built-in descriptor. Each "
-    "process has one core. The presets were tuned on other recordings, at full size."
+    "Numbers of iterations as in the preset, {width} pixels wide, NetVLAD's place taken by the built-in descriptor. "
+    "Each process has one core. The presets were tuned on other recordings, at full size."
 )
 
 
@@ -102,10 +108,10 @@ def sections(measured: dict[str, Any]) -> list[Section]:
     made = []
     for source in dict.fromkeys(result["job"]["source"] for result in results):
         runs = [r for r in results if r["job"]["source"] == source and r["problem"] is None]
-        rows = []
+        rows, widest = [], max((width_of(run) for run in runs), default=0)
         for name in dict.fromkeys(run["job"]["preset"] for run in runs):
             same = [run for run in runs if run["job"]["preset"] == name]
-            full_size = LIGHT in name and any(f"input.width={WIDTH_PX}" in run["job"]["settings"] for run in same)
+            full_size = LIGHT in name and any(width_of(run) == widest for run in same)
             rows.append(
                 [
                     f"{name} (not light: full size)" if full_size else name,
@@ -113,7 +119,8 @@ def sections(measured: dict[str, Any]) -> list[Section]:
                 ]
             )
         frames = int(runs[0]["figures"]["frames"]) if runs else 0
-        made.append(Section(source, ["preset", *(t for t, _, _ in COLUMNS)], rows, f"{frames} frames. {NOTE}"))
+        said = f"{frames} frames. {NOTE.format(width=widest)}"
+        made.append(Section(source, ["preset", *(title for title, _, _ in COLUMNS)], rows, said))
     return [section for section in [*made, failures(results)] if section.rows]
 
 
