@@ -75,9 +75,9 @@ Reduced = tuple[float, NDArray[np.float32], NDArray[np.float32]]
 WIDTH, REACH, FEWEST = 80, 8, 40
 """Image width, pixels, at which frames are compared; largest delay that is searched, frames; a delay is estimated from
 at least this many frames."""
-MIN_CORRELATION, MIN_GAIN, MIN_DELAY = 0.6, 0.1, 0.7
+MIN_CORRELATION, SURE, MIN_DELAY = 0.6, 2.0, 0.7
 """Below this correlation of the motion energies the delay is unknown. It is reported if its correlation is above that
-without a delay by this, and if it has at least so many frames."""
+without a delay by so many standard deviations (`_sureness`), and if it has at least so many frames."""
 JUMP, JUMP_LEAST, BLACK = 2.8, 0.08, 0.02
 """A view jumps if the image changes by more than this multiple of the median change around it, and by at least this on
 average; a frame is black if 99 % of its pixels are below this; colours 0 to 1."""
@@ -126,7 +126,9 @@ class Motion:
         lags = np.arange(-REACH, REACH + 1)
         scores = np.array([_correlation(color, depth, int(lag)) for lag in lags])
         best = int(scores.argmax())
-        if not 0 < best < len(lags) - 1 or scores[best] < MIN_CORRELATION or scores[best] - scores[REACH] < MIN_GAIN:
+        if not 0 < best < len(lags) - 1 or scores[best] < MIN_CORRELATION:
+            return None
+        if _sureness(scores[best], scores[REACH], color, depth) < SURE:
             return None
         below, peak, above = scores[best - 1 : best + 2]
         delay = float(lags[best] + 0.5 * (below - above) / (below - 2 * peak + above - 1e-12))
@@ -231,6 +233,17 @@ def _correlation(first: Numbers, second: Numbers, lag: int) -> float:
     a = first[: len(first) - lag] if lag >= 0 else first[-lag:]
     b = second[lag:] if lag >= 0 else second[: len(second) + lag]
     return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else 0.0
+
+
+def _sureness(higher: float, lower: float, first: Numbers, second: Numbers) -> float:
+    """Return by how many standard deviations two correlations of the same series differ (Fisher 1921), if they were
+    independent. A smooth motion has fewer independent frames than frames (Bartlett 1946)."""
+    a, b = ((values - values.mean()) / (values.std() + 1e-12) for values in (first, second))
+    lags = np.arange(1, len(a) // 2)
+    shared = sum(2.0 * (1.0 - k / len(a)) * (a[k:] * a[:-k]).mean() * (b[k:] * b[:-k]).mean() for k in lags)
+    independent = len(a) / max(1.0 + shared, 1.0)
+    apart = np.diff(np.arctanh(np.clip([lower, higher], -0.999, 0.999)))
+    return float(apart[0] * np.sqrt(max(independent - 3.0, 0.0) / 2.0))
 
 
 def motion_warnings(motion: Motion, first: int = 0) -> list[str]:
