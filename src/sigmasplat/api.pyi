@@ -139,6 +139,7 @@ from sigmasplat.graph.loops import Loop as Loop
 from sigmasplat.graph.path_covariance import PathCovariance as PathCovariance
 from sigmasplat.input.calibration import (
     ASSUMED as ASSUMED,
+    DEFINED as DEFINED,
     MEASURED as MEASURED,
     MM_PER_METRE as MM_PER_METRE,
     TUM_UNITS_PER_METRE as TUM_UNITS_PER_METRE,
@@ -164,17 +165,21 @@ from sigmasplat.input.images import (
     DEPTH_FOLDERS as DEPTH_FOLDERS,
     FRAMES_PER_SECOND as FRAMES_PER_SECOND,
     NAMED as NAMED,
+    VIDEO_ENDINGS as VIDEO_ENDINGS,
     FrameFiles as FrameFiles,
     Video as Video,
+    dated_seconds as dated_seconds,
     depth_to_metres as depth_to_metres,
     depth_values as depth_values,
     first_file as first_file,
     first_subfolder as first_subfolder,
     frame_files as frame_files,
     has_frame_files as has_frame_files,
+    image_folder as image_folder,
     image_size as image_size,
     index_by_number as index_by_number,
     list_images as list_images,
+    named_as as named_as,
     natural_key as natural_key,
     pair_images as pair_images,
     read_color as read_color,
@@ -191,7 +196,7 @@ from sigmasplat.input.imu import (
     accelerometer_from_samples as accelerometer_from_samples,
     gyroscope_from_samples as gyroscope_from_samples,
 )
-from sigmasplat.input.intrinsics import intrinsics_beside as intrinsics_beside
+from sigmasplat.input.intrinsics import intrinsics_beside as intrinsics_beside, read_intrinsics as read_intrinsics
 from sigmasplat.input.lists import (
     FLIP_YZ as FLIP_YZ,
     associate as associate,
@@ -213,7 +218,6 @@ from sigmasplat.input.lists import (
     to_matrix as to_matrix,
 )
 from sigmasplat.input.opening import (
-    VIDEO_ENDINGS as VIDEO_ENDINGS,
     format_name as format_name,
     open_source as open_source,
     sqlite_tables as sqlite_tables,

@@ -203,6 +203,7 @@ def test_without_depth_the_keys_of_a_frame_are_named(tmp_path: Path) -> None:
         layouts.nerfstudio(tmp_path, sample()),
         lambda fields: [frame.update(depth_map=frame.pop("depth_file_path")) for frame in fields["frames"]],
     )
+    next(folder.glob("depth*")).rename(folder / "maps")
     with pytest.raises(SourceError, match=r"file_path, transform_matrix, depth_map\); export depth"):
         open_source(folder)
 

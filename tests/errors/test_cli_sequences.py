@@ -72,7 +72,7 @@ def pose_line(line: str) -> Callable[[Path], object]:
 def no_lists(folder: Path) -> None:
     for part in ("rgb", "depth"):
         (folder / f"{part}.txt").unlink()
-        (folder / part).rename(folder / f"my_{part}")
+        (folder / part).rename(folder / f"z_{part[::-1]}")
 
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {

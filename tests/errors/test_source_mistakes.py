@@ -102,6 +102,14 @@ def sequence_packed(folder: Path) -> Path:
     return scene
 
 
+def both(*damages: Damage) -> Damage:
+    def damage(folder: Path) -> None:
+        for each in damages:
+            each(folder)
+
+    return damage
+
+
 def second_sequence(folder: Path) -> Path:
     shutil.copytree(folder, folder.parent / "seq-02")
     return folder.parent
@@ -167,8 +175,8 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
         "transforms damaged": (with_text("dslr/nerfstudio/transforms_undistorted.json", "{"), ("JSON",)),
     },
     "seven_scenes": {
-        "not unzipped": (sequence_packed, ("seq-01.zip", "unzip")),
-        "a scene with several sequences": (second_sequence, ("holds 2 sequences", "seq-01, seq-02", "give one")),
+        "not unzipped": (sequence_packed, ("seq-01.zip", "unpack it first")),
+        "a scene with several sequences": (second_sequence, ("holds sequences", "seq-01", "seq-02", "give the path")),
         "only colour": (without("*.depth.png"), LISTS),
         "a truncated pose": (with_text("frame-000001.pose.txt", "1 0 0"), ("frame-000001.pose.txt", "4×4")),
         "images made smaller": (resized("*.png", (320, 240)), ("320×240", "640×480", "calibration")),
@@ -189,7 +197,7 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
             fields("camera_intrinsic.json", lambda f: f.pop("intrinsic_matrix")), ("intrinsic_matrix", "9 numbers"),
         ),
         "intrinsics for another size": (
-            fields("camera_intrinsic.json", lambda f: f.update(width=640, height=480)), ("32×24", "640×480"),
+            fields("camera_intrinsic.json", lambda f: f.update(width=640, height=400)), ("32×24", "640×400"),
         ),
         "a truncated log": (with_text("trajectory.log", "0 0 1\n1 0 0 0\n"), ("trajectory.log", "truncated")),
         "a log that is not rigid": (with_text("trajectory.log", "0 0 1\n" + SCALED_ROWS), ("log:1", "not a rigid")),
@@ -214,7 +222,10 @@ MISTAKES: dict[str, dict[str, tuple[Damage, tuple[str, ...]]]] = {
     },
     "nerfstudio": {
         "only colour": (
-            fields("transforms.json", lambda f: [frame.pop("depth_file_path") for frame in f["frames"]]),
+            both(
+                fields("transforms.json", lambda f: [frame.pop("depth_file_path") for frame in f["frames"]]),
+                without("depth*"),
+            ),
             ("depth_file_path", "export"),
         ),
         "several cameras": (

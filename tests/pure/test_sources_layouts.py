@@ -1,6 +1,7 @@
 """Write each data set's layout by hand and read it back: format, camera, colour, depth, times and ground truth."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -46,9 +47,11 @@ def test_recognition_is_unambiguous(layout, tmp_path):
 
 
 @each_layout
-def test_the_parent_folder_lists_the_sequences_in_it(layout, tmp_path):
+def test_the_only_sequence_in_a_folder_is_opened_and_of_several_their_names_are_told(layout, tmp_path):
     folder = layout.write(tmp_path, sample(layout.size))
-    outer = tmp_path if folder.parent == tmp_path else folder.parent.parent
+    outer = folder.parent
+    assert open_source(outer, **layout.options).origins["recording"] == (str(folder), f"the only one in {outer}", "")
+    shutil.copytree(folder, outer / "second_freiburg3_bonn")
     with pytest.raises(Exception, match=r"holds sequences: .*; give the path of one of them") as caught:
         open_source(outer)
     assert layout.format in str(caught.value)

@@ -73,6 +73,7 @@ class CameraUnknown(SourceError):
         self.size = size
 
 
+DEFINED = Origin("", "defined by the format")
 MOST_NUMBER = 1e100
 """Larger numbers are refused: their squares are not finite, and no field of a recording needs them."""
 
@@ -135,6 +136,16 @@ def read_calibration(
     return replace(calibration, depth_camera=camera, depth_distortion=lens, T_color_depth=T_color_depth)
 
 
+OURS = {"fx", "fy", "cx", "cy", "depth_scale", "distortion", "sensor", "depth_camera", "T_color_depth", "baseline_m"}
+
+
+def own_calibration(folder: Path) -> Path | None:
+    """Return calibration.json of a folder; None without one, or if another program wrote it. Raises SourceError."""
+    path = folder / "calibration.json"
+    written = read_json(path) if exists(path) else {}
+    return None if isinstance(written, dict) and not written.keys() & OURS else path
+
+
 def resolve_calibration(
     folder: Path, recorded: Calibration | None, size: tuple[int, int], settings: InputConfig, default_units: float
 ) -> Calibration:
@@ -143,11 +154,10 @@ def resolve_calibration(
     `folder` is the recording, a folder or a file; `size` (width, height) is that of the colour image. Raises
     CameraUnknown if no focal length is given.
     """
-    beside = folder / "calibration.json"
-    if settings.calibration or exists(beside):
-        recorded = read_calibration(Path(settings.calibration or beside), size, default_units, recorded)
+    if file := settings.calibration or own_calibration(folder):
+        recorded = read_calibration(Path(file), size, default_units, recorded)
     if recorded is None and not settings.fx:
-        place = "a file for --calibration" if folder.is_file() else beside
+        place = "a file for --calibration" if folder.is_file() else folder / "calibration.json"
         raise CameraUnknown(
             size,
             f"camera unknown: {folder} has no intrinsics; write {place} with fx, fy, cx, cy, "

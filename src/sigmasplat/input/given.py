@@ -3,6 +3,7 @@
 Masks: a folder with one image per frame, non-zero = ignore. Poses are used as they are, and no frame is tracked:
 
 TUM text                 timestamp tx ty tz qx qy qz qw [id]        camera to world; frames are found by their times
+tx ty tz qx qy qz qw     camera to world; one line per frame; TartanAir's pose_left.txt: x forward, y right, z down
 KITTI text               12 or 16 numbers, a matrix by rows         camera to world; one line per frame
 images.txt of COLMAP     number qw qx qy qz tx ty tz camera name    world to camera; frames are found by their names
 transforms.json          frames with file_path, transform_matrix    nerfstudio; frames are found by their names
@@ -11,6 +12,7 @@ a folder                 0.txt, 1.txt, …: one matrix per frame      camera to 
 Cameras look along z, with x to the right and y down; transforms.json has its own axes (`input/transforms.py`).
 """
 
+import re
 from dataclasses import replace
 from pathlib import Path, PureWindowsPath
 
@@ -94,7 +96,9 @@ class Masked(Subset):
         return np.asarray(chosen, np.bool_)
 
 
-TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = (8, 9), 10, (12, 16)
+PLAIN_WORDS, TUM_WORDS, COLMAP_WORDS, MATRIX_WORDS = 7, (8, 9), 10, (12, 16)
+TARTANAIR, T_FORWARD = re.compile(r"pose_(left|right|[lr]cam_\w+)\.txt"), np.eye(4)[[2, 0, 1, 3]]
+"""Names of TartanAir's poses, and the transform to its axes (x forward, y right, z down) from ours."""
 FORMATS = "give TUM or KITTI text, with no more columns, COLMAP's images.txt, transforms.json, or a folder of matrices"
 
 GivenPoses = Trajectory | list[Matrix | None] | dict[str, Matrix]
@@ -117,6 +121,10 @@ def read_given_poses(path: Path) -> GivenPoses:
     words = next((words for _, words in read_lines(path) if _is_number(words[0])), list[str]())
     if (count := len(words)) in TUM_WORDS:
         return lists.read_poses(path)
+    if count == PLAIN_WORDS:
+        lines = ((f"{path}:{line}", lists.parse_numbers(path, line, words)) for line, words in read_lines(path))
+        T_axes = T_FORWARD if TARTANAIR.fullmatch(path.name) else np.eye(4)
+        return [lists.rigid_transform(at, v[:3], [v[6], *v[3:6]]) @ T_axes for at, v in lines]
     if count in MATRIX_WORDS:
         rows = ((f"{path}:{line}", lists.parse_any_numbers(path, line, words)) for line, words in read_lines(path))
         return [checked_pose(where, lists.to_matrix(where, values)) for where, values in rows]

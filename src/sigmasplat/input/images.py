@@ -98,6 +98,10 @@ def read_depth(path: Path, units_per_metre: float, confidence: Path | None = Non
 
 def depth_to_metres(path: Path, raw: NDArray[Any], units_per_metre: float) -> NDArray[np.float32]:
     """Convert a stored depth image to float32 metres, as `read_depth` does; `path` names it. Raises SourceError."""
+    if raw.ndim == 3 and 1 in (raw.shape[0], raw.shape[2]):
+        raw = raw.reshape(raw.shape[:2] if raw.shape[2] == 1 else raw.shape[1:])
+    elif raw.dtype == np.uint8 and raw.shape[2:] == (4,) and (raw[..., 3] < 128).all():  # the bytes of floats, as BGRA
+        raw = np.ascontiguousarray(raw[..., [2, 1, 0, 3]]).view("<f4")[..., 0]
     if raw.ndim != 2 or raw.dtype == np.uint8 or raw.dtype.kind not in "iuf":
         raise SourceError(
             f"{path}: not a depth image (found {raw.dtype} {raw.shape}); JPEG and 8 bits hold no metric depth: "
@@ -170,6 +174,7 @@ FRAMES_PER_SECOND = 30.0
 COLOR_FOLDERS = ("color", "colour", "rgb", "image", "images")
 DEPTH_FOLDERS = ("depth", "depths")
 COLOR_ENDINGS = (".jpg", ".jpeg", ".png", ".bmp", ".ppm", ".tif", ".tiff", ".webp")
+VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".webm", ".3gp", ".mts")
 DEPTH_ENDINGS = (".png", ".pgm", ".pfm", ".tif", ".tiff", ".npy", ".npz", ".exr")
 
 Key = TypeVar("Key", int, str)
@@ -178,6 +183,22 @@ Key = TypeVar("Key", int, str)
 def first_subfolder(folder: Path, names: Iterable[str]) -> Path | None:
     """Return the first of the named subfolders that exists, None if none does."""
     return next((folder / name for name in names if (folder / name).is_dir()), None)
+
+
+NO_IMAGES = {"right", "vis", "viz", "preview", "mask", "masks", "confidence", "conf", "ir", "infrared", "normal"}
+"""Words of names of folders and files that hold no colour or depth of the left or only camera."""
+
+
+def named_as(paths: Iterable[Path], names: Iterable[str]) -> list[Path]:
+    """Return the files or folders with one of the names as a word of theirs: image_left, JPEGImages, 0001-color."""
+    words = [(p, {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", p.stem)}) for p in paths]
+    return [path for path, found in words if found & {*names} and not found & NO_IMAGES]
+
+
+def image_folder(folder: Path, names: Sequence[str]) -> Path | None:
+    """Return the first of the named subfolders that exists, else the only one that is `named_as` they are, or None."""
+    found = named_as((path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else (), names)
+    return first_subfolder(folder, names) or (found[0] if len(found) == 1 else None)
 
 
 def first_file(folder: Path, names: Iterable[str | Path]) -> Path | None:
@@ -189,8 +210,10 @@ def list_images(folder: Path | None, endings: Sequence[str]) -> list[Path]:
     """Return the images of a folder in the order of the times in their names, else of the numbers: 2 before 10."""
     if folder is None or not folder.is_dir():
         return []
-    found = (path for path in folder.iterdir() if path.suffix.lower() in endings and not path.name.startswith("."))
-    paths = sorted(found, key=natural_key)
+    entries = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    if len(entries) == 1 and entries[0].is_dir():  # Camera_0
+        return list_images(entries[0], endings)
+    paths = sorted((path for path in entries if path.suffix.lower() in endings), key=natural_key)
     return [paths[i] for i in np.argsort(times_of_names(paths)[0])]
 
 
@@ -245,6 +268,13 @@ def seconds_of(values: NDArray[np.float64], decimal: bool) -> NDArray[np.float64
     return values if decimal and step > 1e-3 else None
 
 
+def dated_seconds(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return times [N] of a list in seconds: those in ms, µs or ns are recognised by their dates."""
+    low, high = float(times.min(initial=np.inf)), float(times.max(initial=0.0))
+    units = (unit for unit in (1e-3, 1e-6, 1e-9) if DATES_S[0] < low * unit and high * unit < DATES_S[1])
+    return times * next(units, 1.0)
+
+
 def index_by_number(paths: Iterable[Path]) -> dict[int, Path]:
     """Map the last number in each file name to its path, ascending; names without a number are left out. If the names
     are alike, it is the last number that differs: 8 of 008_16bit."""
@@ -263,7 +293,7 @@ def pair_images(
     color_name, depth_name: file patterns for messages. Raises SourceError if one kind is missing or no key is shared.
     """
     if not depths:
-        place = first_subfolder(folder, DEPTH_FOLDERS) or folder / Path(depth_name).parent
+        place = image_folder(folder, DEPTH_FOLDERS) or folder / Path(depth_name).parent
         found = sorted(path for path in place.glob(f"{Path(depth_name).stem}.*") if path.suffix and path.is_file())
         raise SourceError(
             f"no depth images in {place} (found {len(found)} other files, such as {found[0].name}); "
@@ -273,7 +303,8 @@ def pair_images(
             "see docs/data.md#without-depth"
         )
     if not colors:
-        raise SourceError(f"no colour images in {folder} (looked for {color_name}); is the download complete?")
+        hint = "is the download complete? convert other images to JPEG, a video with: ffmpeg -i FILE color/%06d.png"
+        raise SourceError(f"no colour images in {folder} (looked for {color_name}); {hint}")
     keys = [key for key in colors if key in depths]
     if not keys:
         first = f"{next(iter(colors.values())).name} and {next(iter(depths.values())).name}"

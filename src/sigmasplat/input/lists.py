@@ -15,6 +15,7 @@ from sigmasplat.data.trajectory import MOST_M, Trajectory
 from sigmasplat.errors import SourceError
 from sigmasplat.files.reading import exists, read_text
 from sigmasplat.input.calibration import ASSUMED, Origin
+from sigmasplat.input.images import dated_seconds
 from sigmasplat.types import Matrix
 
 MOST_MATRIX_BYTES = 1 << 16
@@ -109,7 +110,7 @@ def read_poses(path: Path, may_be_empty: bool = False) -> Trajectory:
     for (line, _), length in zip(lines, np.linalg.norm(table[:, 4:], axis=1), strict=True):
         _refuse_unless_unit(f"{path}:{line}", length)
     T[:, :3, :3], T[:, :3, 3] = se3.rotation_from_quaternion(table[:, [7, 4, 5, 6]]), table[:, 1:4]
-    return Trajectory(table[:, 0], T)
+    return Trajectory(dated_seconds(table[:, 0]), T)
 
 
 def read_groundtruth(folder: Path) -> Trajectory | None:
@@ -140,9 +141,13 @@ def read_listed(path: Path, form: str) -> Iterator[tuple[list[float], list[Path]
     """Yield times and image files of each line; form: "time path", or "time path time path". Raises SourceError without
     lines, or naming one of another form."""
     lines = [(i, line.strip(" ,\t")) for i, line in enumerate(read_text(path).split("\n"), 1)]
-    if not (lines := [(i, line) for i, line in lines if line and not line.startswith("#")]):
+    lines = [(i, line) for i, line in lines if line and not line.startswith("#")]
+    lines = lines[bool(lines) and lines[0][1].lower().startswith("time") :]  # a header
+    if not lines:
         raise SourceError(f"{path}: lists no images")
+    ids = all(re.fullmatch(r"\d+[\s,]+[\d.]+[\s,]+\S*[^\d\s]\S*", line) for _, line in lines)
     pattern = r"([^\s,]+)[\s,]+(\S.*?)" + r"[\s,]+([-+.\deE]+)[\s,]+(\S.*?)" * (form.count("path") - 1)
+    pattern = r"\d+[\s,]+" * ids + pattern
     for i, line in lines:
         if not (found := re.fullmatch(pattern, line)):
             raise SourceError(f"{path}:{i}: expected {form!r}, found {line[:60]!r}")
@@ -151,10 +156,11 @@ def read_listed(path: Path, form: str) -> Iterator[tuple[list[float], list[Path]
 
 
 def listed_file(folder: Path, written: str) -> Path:
-    """Return the file that a list in a folder names: as written, else without a comment, with "\\" as a separator, and
-    by the last two parts of an absolute path, which was another machine's."""
+    """Return the file that a list in a folder names: as written, else without a comment, with "\\" as a separator,
+    by the last two parts of an absolute path, which was another machine's, and without further columns."""
     name = PureWindowsPath(re.sub(r"\s+#.*", "", written).strip("\"'"))
-    tries = folder / written, folder / name.as_posix(), folder.joinpath(*name.parts[-2 if name.anchor else 0 :])
+    tries = [folder / written, folder / name.as_posix(), folder.joinpath(*name.parts[-2 if name.anchor else 0 :])]
+    tries += [folder / re.split(r"[\s,]", name.as_posix())[0]]
     return next((path for path in tries if path.is_file()), tries[1])
 
 

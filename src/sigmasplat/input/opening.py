@@ -16,12 +16,12 @@ from sigmasplat.data.camera_errors import CameraErrors
 from sigmasplat.errors import ConfigError, SourceError, nearest
 from sigmasplat.files.pictures import open_image
 from sigmasplat.files.reading import guarded, open_regular
+from sigmasplat.input.calibration import Origin
 from sigmasplat.input.given import Corrected, Masked, Posed
-from sigmasplat.input.images import COLOR_ENDINGS
+from sigmasplat.input.images import COLOR_ENDINGS, VIDEO_ENDINGS
 from sigmasplat.input.source import Source, Subset
 from sigmasplat.registry import SourceFormat, rows
 
-VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".webm", ".3gp", ".mts")
 PHOTO_ENDINGS = (*COLOR_ENDINGS, ".heic", ".dng")
 RGBD_ENDINGS = (".exr", ".npy", ".pgm", ".bag", ".mcap", ".db3", ".r3d", ".sens", ".oni", ".klg", ".svo", ".mkv")
 """Files that may hold depth; .mkv is what Azure Kinect records."""
@@ -78,6 +78,13 @@ def _is_color_image(path: Path) -> bool:
         return True  # .heic, .dng, or damaged: then its name decides
 
 
+REMEDIES = {
+    ".zip .tar .tgz .gz .bz2 .xz .zst .7z .rar": "an archive; unpack it first",
+    ".mkv": "a recording of Azure Kinect; extract it with Open3D's azure_kinect_mkv_reader.py",
+    ".svo .svo2": "a recording of a ZED; export it with ZED_SVO_Export, mode 4 (left images and 16-bit depth)",
+    ".oni .klg": "a recording of OpenNI; export it as images of colour and 16-bit PNG of depth",
+}
+"""What files of other programs are, by their endings, and how they can be read."""
 PACKED = (".bag", ".mcap", ".db3", ".r3d")
 """Endings of files that may each be a whole sequence. A folder of such files is refused with their names."""
 
@@ -118,9 +125,11 @@ def _whole(path: str | Path, settings: InputConfig) -> Source:
         predicted = importlib.import_module("sigmasplat.plugins.predicted_depth.source")
         if predicted.lacks_depth(Path(path), _sure_format(path) is not None):
             return cast(Source, predicted.open_color_only(Path(path), settings))
-    known = format_of(path)
-    source = known.open(str(path), settings)
+    known, place = _found(path)
+    source = known.open(str(place), settings)
     source.sensor = source.sensor or known.sensor
+    if place != path:
+        source.origins["recording"] = Origin(str(place), f"the only one in {path}")
     return cast(Source, predicted.WithPredictedDepth(source, settings)) if predicted else source
 
 
@@ -134,10 +143,19 @@ def format_name(path: str | Path, settings: InputConfig) -> str:
 
 def format_of(path: str | Path) -> SourceFormat:
     """Return the first format that recognises the path. Raises SourceError if none does."""
+    return _found(path)[0]
+
+
+def _found(path: str | Path) -> tuple[SourceFormat, str | Path]:
+    """Return the format and the path of a recording, or of the only recording in a folder that is none itself."""
     with _guarded(path):
-        if (known := _matching_format(path)) is None:
+        if known := _matching_format(path):
+            return known, path
+        entries = [entry for entry in Path(path).iterdir() if entry.is_dir()] if Path(path).is_dir() else []
+        inner = [(known, entry) for entry in entries if (known := _matching_format(entry))]
+        if len(inner) != 1:
             raise _unknown_format(Path(path))
-        return known
+        return inner[0]
 
 
 def _guarded(path: str | Path) -> AbstractContextManager[None]:
@@ -190,6 +208,9 @@ def _unknown_format(path: Path) -> SourceError:
             return SourceError(f"{file} is {what}, then name their folders rgb and depth, and give what holds both")
     if problem := without_depth(path):
         return problem
+    for file in sorted(path.glob("*.*")) if path.is_dir() else [path]:
+        if remedy := next((r for endings, r in REMEDIES.items() if file.suffix.lower() in endings.split()), None):
+            return SourceError(f"{file} is {remedy}, and give the folder of the images")
     known_names = ", ".join(known.name for known in formats())
     if not path.is_dir():
         return SourceError(

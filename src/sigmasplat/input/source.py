@@ -46,7 +46,8 @@ FACTS = (
     "depth_units_per_metre", "depth_registered", "registrable", "computed_depth", "predicted_depth",
     "scene_scale", "depth_noise_per_m", "sensor", "origins", "depth_doubts", "path_by",
 )  # fmt: skip
-"""What a source that wraps another one has in common with it."""
+ANSWERS = ("device_path", "test_views", "true_surface", "true_surface_file")
+"""What a source that wraps another one has in common with it, and the methods that it passes on."""
 ALL_FRAMES = InputConfig()
 CORRECTED = ("orientation", "gray", "farthest depth")
 """Origins of how images are changed when they are read."""
@@ -206,23 +207,11 @@ class Wrapped(Source):
     def __init__(self, whole: Source) -> None:
         super().__init__(whole.name, whole.camera, whole.strict)
         self._whole, self.skipped = whole, whole.skipped
-        for fact in FACTS:
+        for fact in FACTS + ANSWERS:
             setattr(self, fact, getattr(whole, fact))
 
     def truth(self) -> Trajectory | None:
         return self._whole.truth()
-
-    def device_path(self) -> Trajectory | None:
-        return self._whole.device_path()
-
-    def test_views(self) -> Source | None:
-        return self._whole.test_views()
-
-    def true_surface(self) -> Mesh | None:
-        return self._whole.true_surface()
-
-    def true_surface_file(self) -> Path | None:
-        return self._whole.true_surface_file()
 
 
 class Subset(Wrapped):

@@ -162,7 +162,7 @@ def refuse_first_without_depth(frame: Frame, config: Config) -> None:
     if not (frame.depth_m > 0).any():
         raise SourceError(
             f"frame {frame.index} has no depth reading in [{config.input.min_depth_m}, {config.input.max_depth_m}] m "
-            "to start a map from; check the depth scale or start at a later one"
+            "to start a map from; check the depth scale, or start at a later one: --start SECONDS"
         )
 
 

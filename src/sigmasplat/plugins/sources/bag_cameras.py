@@ -8,7 +8,7 @@ Intrinsics are in sensor_msgs/CameraInfo beside the images (camera_info). Camera
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def lookup_transform(bag: Bag, target: str, source: str, use_tf: bool = True) ->
                 T = transform_of(f"{bag.path}: {name}: {parent} to {child}", link.transform)
                 edges.setdefault(parent, {}).setdefault(child, T)
                 edges.setdefault(child, {}).setdefault(parent, se3.inverse(T))
-        if (found := _chained(edges, target, source)) is not None:
+        if (found := chained(edges, target, source)) is not None:
             return found
     return None
 
@@ -47,7 +47,7 @@ def transform_of(where: str, message: Message) -> Matrix:
     return api.rigid_transform(where, [t.x, t.y, t.z], [q.w, q.x, q.y, q.z])
 
 
-def _chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:
+def chained(edges: dict[str, dict[str, Matrix]], target: str, source: str) -> Matrix | None:
     """Return T_target_source by breadth-first search from the target, None if the source is not connected."""
     reached = {target: np.eye(4)}
     queue = [target]
@@ -123,6 +123,7 @@ def image_topics(bag: Bag, kind: ImageKind, other_names: Sequence[str] = ()) -> 
 def topic_by_name(bag: Bag, name: str) -> ImageTopic:
     """Return a topic by name. Raises SourceError if it does not exist or holds no images."""
     topics = {topic.name: topic for topic in bag.topics_of_type(RAW, COMPRESSED)}
+    name = name if name in topics else f"/{name}"
     if name not in topics:
         raise SourceError(
             f"{bag.path}: no images in topic {name}{api.nearest(name, list(topics))}; "
@@ -145,7 +146,7 @@ def _one_camera(bag: Bag, what: str, topics: list[ImageTopic], option: str) -> I
         raise SourceError(
             f"{bag.path}: no {what} images in {topics[0].name if topics else 'any topic'}; "
             f"the bag holds {bag_messages.list_topics(bag.topics.values())}{stored}; record colour as rgb8, mono8 or "
-            f"JPEG and depth as 16UC1 or 32FC1, or choose another topic: --{option}-topic NAME"
+            f"JPEG and depth as 16UC1 or 32FC1 (republish RVL as PNG), or choose another topic: --{option}-topic NAME"
         )
     cameras = sorted({topic.camera for topic in topics})
     if len(cameras) > 1:
@@ -192,10 +193,13 @@ def read_bag_calibration(bag: Bag, color: ImageTopic, depth: ImageTopic, setting
 def read_optics(bag: Bag, topic: ImageTopic) -> Optics | None:
     """Read the CameraInfo of an image topic; None if it is missing or empty. Raises SourceError if it is damaged."""
     infos = {info.name for info in bag.topics_of_type("sensor_msgs/msg/CameraInfo")}
-    names = (f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info")
-    if (name := next((name for name in names if name in infos), None)) is None:
+    names = [f"{topic.camera}/camera_info", f"{topic.base.removesuffix('/image/data')}/info/camera_info"]
+    beside = (name for name in [*names, f"{topic.base}/camera_info"] if name in infos)
+    of_frame = (n for n in sorted(infos) if topic.frame == bag.first_message(n).header.frame_id.lstrip("/") != "")
+    if (name := next(chain(beside, of_frame), None)) is None:
         return None
-    info = bag.first_message(name)
+    first = islice(bag.messages(name), MAX_TF_MESSAGES)  # a driver may start with zeros
+    info = next((message for message in first if next(iter(_field(message, "k")))), bag.first_message(name))
     rectified, where = "rect" in topic.base.rpartition("/")[2], bag.path / name.lstrip("/")
     k = np.asarray(_field(info, "p")).reshape(3, 4)[:, :3]
     if not rectified or k[0, 0] <= 0:

@@ -70,8 +70,8 @@ class Bag:
         self._reader = self._guarded(lambda: reader(path))
         self._guarded(self._reader.open)
         weakref.finalize(self, self._reader.close)
-        self.topics = {
-            name: Topic(name, info.msgtype or "", info.msgcount)
+        self.topics = {  # ROS 1 records names that lack their slash
+            f"/{name.lstrip('/')}": Topic(f"/{name.lstrip('/')}", info.msgtype or "", info.msgcount)
             for name, info in self._guarded(lambda: self._reader.topics).items()
         }
 
@@ -108,10 +108,11 @@ class Bag:
         self, names: Sequence[str], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[tuple[str, int, bytes]]:
         """Yield topic name, recording time and bytes of each message of the topics."""
-        connections = [connection for connection in self._reader.connections if connection.topic in names]
+        known = [name.lstrip("/") for name in names]
+        connections = [connection for connection in self._reader.connections if connection.topic.lstrip("/") in known]
         items = self._guarded(lambda: self._reader.messages(connections, start_ns, stop_ns))
         while (item := self._guarded(lambda: next(items, None))) is not None:
-            yield item[0].topic, item[1], item[2]
+            yield f"/{item[0].topic.lstrip('/')}", item[1], item[2]
 
     def _stamp_ns(self, raw: bytes) -> int:
         """Read the time of a header: ROS 1 starts with a sequence number, CDR with four bytes for the byte order."""
@@ -184,8 +185,9 @@ def image_kind(message: Message) -> tuple[ImageKind, str]:
     """Return the kind of an image message, "" if it cannot be read, and how its pixels are stored, in words of ROS."""
     raw = hasattr(message, "encoding")
     text = str(message.encoding if raw else message.format)
-    if "compressedDepth" in text or text.startswith(tuple(DEPTH_TYPE)):
-        return "depth", text
+    gray_16 = not raw and (message.data[:4].tobytes(), message.data[24:26].tobytes()) == (b"\x89PNG", b"\x10\0")
+    if "compressedDepth" in text or text.startswith(tuple(DEPTH_TYPE)) or gray_16:
+        return "" if "rvl" in text.lower() else "depth", text
     known: ImageKind = "gray" if text.startswith(("mono8", "8UC1")) else "colour"
     return known if not raw or text.replace("16", "8") in COLOR_FORMS else "", text
 
@@ -195,6 +197,8 @@ def message_size(path: Path, message: Message) -> tuple[int, int]:
     if hasattr(message, "encoding"):
         return int(message.width), int(message.height)
     data = message.data.tobytes()
+    if "rvl" in message.format.lower():
+        return 0, 0  # RVL is not supported
     start = HEADER_BYTES if "compressedDepth" in message.format else 0
     return api.image_size(path, data[start:])
 
@@ -231,8 +235,6 @@ def decode_depth_message(path: Path, message: Message, units_per_metre: float) -
 
 
 def _decompressed(path: Path, message: Message, units_per_metre: float) -> NDArray[np.float32]:
-    if "rvl" in message.format.lower():
-        raise SourceError(f"{path}: depth is compressed as RVL, which is not supported; republish it as PNG or raw")
     data = message.data.tobytes()
     has_header = "compressedDepth" in message.format
     raw = api.read_values(path, data[HEADER_BYTES * has_header :])

@@ -3,7 +3,8 @@
 
 transforms.json        see `input/transforms.py`; depth_unit_scale_factor or integer_depth_scale is metres per unit,
                        default 0.001; timestamp in every frame, or times in the names, else 1/30 s apart
-images/…  depths/…     file_path and depth_file_path or depth_path, relative to the folder, ordered by time or number
+images/…  depths/…     file_path and depth_file_path or depth_path, relative to the folder, ordered by time or number;
+                       if no frame names its depth, the image of its name in depth/ or depths/
 
 keyframes/cameras/TIME.json  images/TIME.jpg  depth/TIME.png     Polycam: time in µs, fx fy cx cy width height, t_00 …
                        t_23 (camera to world, ARKit's axes), depth in mm; corrected_cameras/ and corrected_images/, if
@@ -14,8 +15,9 @@ frame_00000.json  frame_00000.jpg      3d Scanner App, "All Data": cameraPoseARF
 depth_00000.png  conf_00000.png        world, ARKit's axes), intrinsics (9 numbers by rows), time in s; depth in mm,
                                        confidence 0 to 2; only some frames have a colour image
 
-lowres_wide/VIDEO_TIME.png             ARKitScenes, raw or 3dod: the same names in lowres_depth/ (mm) and confidence/;
-lowres_wide_intrinsics/*.pincam        width height fx fy cx cy, at times that may differ by 1 ms
+lowres_wide/VIDEO_TIME.png             ARKitScenes, raw, 3dod or upsampling: also wide/ or vga_wide/; the same times in
+lowres_depth/ (mm) and confidence/     the names
+lowres_wide_intrinsics/*.pincam        width height fx fy cx cy; times may differ by 1 ms
 lowres_wide.traj                       time, rotation vector, translation in m; world to camera, ten per second
 
 If depth has another size than colour (as on phones), both are assumed to share one camera.
@@ -48,6 +50,10 @@ def _open(
 ) -> RecordedSource:
     named = sorted(api.read_frames(path, fields), key=lambda frame: api.natural_key(frame["file_path"]))
     named = [frame | {DEPTH: frame.get(DEPTH, frame.get("depth_path"))} for frame in named]
+    if by_name := not any(frame[DEPTH] for frame in named):
+        depths = api.list_images(api.image_folder(folder, api.DEPTH_FOLDERS), api.DEPTH_ENDINGS)
+        beside = {depth.stem: str(depth.relative_to(folder)) for depth in depths}
+        named = [frame | {DEPTH: beside.get(Path(frame["file_path"]).stem)} for frame in named]
     frames = [frame for frame in named if isinstance(frame[DEPTH], str)]
     if not frames:
         raise SourceError(
@@ -68,11 +74,12 @@ def _open(
     key = next((key for key in UNIT_KEYS if key in fields), "")
     units = round(1.0 / api.positive_number(path, fields, key, METRES_PER_UNIT), 6)
     known = api.read_transforms_camera(path, fields, frames, api.first_size([i.color for i in images]), units)
-    known = replace(known, origins={**known.origins, "depth unit": read}) if key else known
+    unit = {"depth unit": read if key else api.DEFINED} if key or by != NAME else {}
+    known = replace(known, origins={**known.origins, **unit})
     truth = truth or api.build_trajectory(zip(times_s, (api.read_pose(path, frame) for frame in frames), strict=True))
     return api.folder_source(
         folder, settings, images, known, units, truth, skipped, one_camera=True, estimated=by,
-        origins={"times": times, "pairs": read._replace(value="named in each frame")},
+        origins={"times": times, "pairs": read._replace(value="by name" if by_name else "named in each frame")}, 
     )  # fmt: skip
 
 
@@ -84,8 +91,8 @@ def _files(folder: Path, frame: Fields) -> tuple[Path, Path]:
 
 
 def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
-    """Open a raw export or its folder keyframes. Raises SourceError as `open_nerfstudio`."""
-    folder = _keyframes(place)
+    """Open the folder keyframes of a raw export. Raises SourceError as `open_nerfstudio`."""
+    folder = Path(place)
     kind = "corrected_" if all((folder / f"corrected_{part}").is_dir() for part in ("cameras", "images")) else ""
     frames = []
     for path in api.list_images(folder / f"{kind}cameras", (".json",)):
@@ -96,7 +103,10 @@ def open_polycam(place: str, settings: InputConfig) -> RecordedSource:
         frame |= {key: number(key) + 0.5 for key in ("cx", "cy")}  # ARKit measures from the centre of the first pixel
         frame |= {"transform_matrix": [number(f"t_{i // 4}{i % 4}") for i in range(12)]}
         frames.append(frame | ({"timestamp": int(path.stem) * 1e-6} if path.stem.isdecimal() else {}))
-    return _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings, "ARKit")
+    source = _open(folder, folder / f"{kind}cameras", {"frames": frames}, settings, "ARKit")
+    done, all_images = {Path(frame["file_path"]).stem for frame in frames}, (folder / "images").glob("*.jpg")
+    source.skipped += [f"{path}: not in {kind}cameras" for path in sorted(all_images) if path.stem not in done]
+    return source
 
 
 def open_3d_scanner_app(place: str, settings: InputConfig) -> RecordedSource:
@@ -116,18 +126,23 @@ def open_3d_scanner_app(place: str, settings: InputConfig) -> RecordedSource:
 
 def open_arkitscenes(place: str, settings: InputConfig) -> RecordedSource:
     """Open the folder of a video. Raises SourceError as `open_nerfstudio`."""
-    folder, frames = _video(place), list[Fields]()
-    names, cameras = folder / "lowres_wide", folder / "lowres_wide_intrinsics"
-    colors, pincams = api.list_images(names, (".png",)), api.list_images(cameras, (".pincam",))
-    if not colors or not pincams:
-        raise SourceError(f"{folder}: no .png in {names.name} or no .pincam in {cameras.name}; download both")
-    times_s, path = api.times_of_names(pincams)[0], folder / "lowres_wide.traj"
-    nearest = np.searchsorted((times_s[1:] + times_s[:-1]) / 2, api.times_of_names(colors)[0])
-    for name, i in zip((color.name for color in colors), nearest, strict=True):
-        numbers = _rows(pincams[i], 6)[0] - [0, 0, 0, 0, -0.5, -0.5]
+    folder, frames = Path(place), list[Fields]()
+    names = api.first_subfolder(folder, WIDE) or folder / WIDE[0]
+    cameras = folder / f"{names.name}_intrinsics"
+    colors, depths = (api.list_images(place, (".png",)) for place in (names, folder / "lowres_depth"))
+    if not colors or not depths or not (pincams := api.list_images(cameras, (".pincam",))):
+        raise SourceError(
+            f"{folder}: no .png in {names.name} and depth, or no .pincam in {cameras.name}; download both"
+        )
+    times_s, depth_s, camera_s = (api.times_of_names(paths)[0] for paths in (colors, depths, pincams))
+    near = {i: depths[j].name for i, j in api.associate(times_s, depth_s, settings.max_gap_s).tolist()}
+    nearest = np.searchsorted((camera_s[1:] + camera_s[:-1]) / 2, times_s)
+    for i, (color, j) in enumerate(zip(colors, nearest, strict=True)):
+        numbers, depth = _rows(pincams[j], 6)[0] - [0, 0, 0, 0, -0.5, -0.5], near.get(i)
         frame: Fields = dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers.tolist(), strict=True))
-        depth = f"lowres_depth/{name}" if (folder / "lowres_depth" / name).is_file() else None
-        frames.append(frame | {"file_path": f"lowres_wide/{name}", DEPTH: depth, "confidence": f"confidence/{name}"})
+        frame |= {DEPTH: depth and f"lowres_depth/{depth}", "confidence": f"confidence/{depth}"}
+        frames.append(frame | {"file_path": f"{names.name}/{color.name}"})
+    path = folder / "lowres_wide.traj"
     rows = _rows(path, 7) if path.is_file() else np.zeros((0, 7))
     T_camera_world = se3.exp_stack(np.pad(rows[:, 1:4], ((0, 0), (3, 0))))
     T_camera_world[:, :3, 3] = rows[:, 4:]
@@ -144,21 +159,13 @@ def _rows(path: Path, count: int) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def _video(place: str) -> Path:
-    """Return the folder itself, or that of the frames in it, as 3dod has it: VIDEO/VIDEO_frames."""
-    return next((inner.parent for inner in Path(place).glob("*_frames/lowres_wide")), Path(place))
-
-
-def _keyframes(place: str) -> Path:
-    inner = Path(place) / "keyframes"
-    return inner if inner.is_dir() else Path(place)
-
+WIDE = ("lowres_wide", "wide", "vga_wide")
 
 PLUGIN = (
     SourceFormat("nerfstudio", NAME, lambda path: (Path(path) / NAME).is_file(), open_nerfstudio),
     SourceFormat(
         "Polycam", "keyframes/ with images/, depth/ and cameras/*.json",
-        lambda path: (_keyframes(path) / "depth").is_dir() and any((_keyframes(path) / "cameras").glob("*.json")),
+        lambda path: Path(path, "depth").is_dir() and any(Path(path, "cameras").glob("*.json")),
         open_polycam, sensor="lidar-iphone",
     ),
     SourceFormat(
@@ -168,7 +175,7 @@ PLUGIN = (
     ),
     SourceFormat(
         "ARKitScenes", "lowres_wide/ and lowres_depth/",
-        lambda path: (_video(path) / "lowres_wide").is_dir() and (_video(path) / "lowres_depth").is_dir(),
+        lambda path: bool(api.first_subfolder(Path(path), WIDE)) and Path(path, "lowres_depth").is_dir(),
         open_arkitscenes, sensor="lidar-iphone",
     ),
 )  # fmt: skip

@@ -1,6 +1,7 @@
 """Read plain folders of colour and depth images, and those of Open3D's reconstruction system and of Redwood.
 
-color|colour|rgb|image|images/   depth|depths/     paired by the time in the name, or name, number, order
+color|colour|rgb|image|images/   depth|depths/     paired by the time in the name, or name, number, order; also with
+                                                   other words (image_left/), and in one folder (0-color.png)
 calibration.json                                   fx fy cx cy [width height depth_scale …], or --fx on the command line
 groundtruth.txt                                    optional: "t tx ty tz qx qy qz qw", t as for the images
 
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sigmasplat.api as api
-from sigmasplat.api import Calibration, ImagePair, InputConfig, Origin, RecordedSource, SourceError, SourceFormat
+from sigmasplat.api import ImagePair, InputConfig, Origin, RecordedSource, SourceError, SourceFormat
 
 NAMES = "color|rgb|images/*", "depth/*"
 REMEDY = "write rgb.txt and depth.txt with 'time path' lines, or give each pair the same name"
@@ -33,13 +34,25 @@ REMEDY = "write rgb.txt and depth.txt with 'time path' lines, or give each pair 
 def open_plain(path: str, settings: InputConfig) -> RecordedSource:
     """Open a folder. Raises SourceError if images cannot be paired or the camera is unknown."""
     folder = Path(path)
-    depth_folder = api.first_subfolder(folder, api.DEPTH_FOLDERS)
-    if depth_folder is None and (problem := api.without_depth(folder)):
+    colors, depths = _images(folder)
+    if not depths and not api.image_folder(folder, KINDS[1]) and (problem := api.without_depth(folder)):
         raise problem
-    colors = api.list_images(api.first_subfolder(folder, api.COLOR_FOLDERS), api.COLOR_ENDINGS)
-    images, skipped, origins = _pairs(folder, colors, api.list_images(depth_folder, api.DEPTH_ENDINGS), settings)
+    images, skipped, origins = _pairs(folder, colors, depths, settings)
     truth = api.read_groundtruth(folder)
     return api.folder_source(folder, settings, images, None, api.MM_PER_METRE, truth, skipped, origins=origins)
+
+
+KINDS = api.COLOR_FOLDERS, api.DEPTH_FOLDERS
+
+
+def _images(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Return the images of colour and of depth: of their folders, else of the folder itself by the words of names."""
+    color, depth = (api.image_folder(folder, names) for names in KINDS)
+    if color or depth:
+        return api.list_images(color, api.COLOR_ENDINGS), api.list_images(depth, api.DEPTH_ENDINGS)
+    images = [path for path in api.list_images(folder, api.COLOR_ENDINGS + api.DEPTH_ENDINGS) if path.parent == folder]
+    depths = api.named_as(images, api.DEPTH_FOLDERS)
+    return api.named_as(images, (*api.COLOR_FOLDERS, "left")) or [p for p in images if p not in depths], depths
 
 
 Found = tuple[list[ImagePair], list[str], dict[str, Origin]]
@@ -117,24 +130,14 @@ def open_redwood(path: str, settings: InputConfig) -> RecordedSource:
         times = Origin(f"{rate:g} per second", f"read from {file}") if "fps" in fields else api.ASSUMED_TIMES
         images, origins = [*numbered.values()], {"times": times, "pairs": Origin("by number", api.NAMED)}
     size = api.first_size([image.color for image in images])
-    beside = None if "intrinsic_matrix" in fields else api.intrinsics_beside(folder, settings, size, api.MM_PER_METRE)
-    known = beside or (_recorded(file, fields) if file else PRIMESENSE)
+    known = api.read_intrinsics(file, size, api.MM_PER_METRE) if file else PRIMESENSE
+    if known is None:
+        raise SourceError(f'{file}: field "intrinsic_matrix" is not 9 numbers by columns; correct it')
+    known = known if file else api.intrinsics_beside(folder, settings, size, api.MM_PER_METRE) or known
     truth = _truth(folder, images)
     return api.folder_source(
         folder, settings, images, known, known.depth_units_per_metre, truth, skipped, origins=origins
     )
-
-
-def _recorded(path: Path, fields: dict[str, object]) -> Calibration:
-    values = fields.get("intrinsic_matrix")
-    if not isinstance(values, list) or len(values) != 9:
-        raise SourceError(f'{path}: field "intrinsic_matrix" is {values!r}, expected 9 numbers by columns')
-    fx, fy, cx, cy = (api.json_number(path, {"intrinsic_matrix": values[i]}, "intrinsic_matrix") for i in (0, 4, 6, 7))
-    width, height = (int(api.json_number(path, fields, key)) for key in ("width", "height"))
-    units = api.positive_number(path, fields, "depth_scale", api.MM_PER_METRE)
-    read = Origin("", f"read from {path.name}")
-    origins = {"camera": read} | ({"depth unit": read} if "depth_scale" in fields else {})
-    return Calibration(api.build_camera(path, width, height, [fx, fy, cx, cy]), units, origins=origins)
 
 
 def _truth(folder: Path, images: list[ImagePair]) -> api.Trajectory | None:
@@ -181,7 +184,9 @@ def _is_redwood(path: str) -> bool:
     if colors is None and not (folder / "depth").is_dir():
         return False
     timed = colors is not None and any(_TIMED.fullmatch(entry.stem) for entry in colors.iterdir())
-    return timed or api.first_file(folder, INTRINSIC_NAMES) is not None or _log_in(folder) is not None
+    file = api.first_file(folder, INTRINSIC_NAMES)
+    its_own = file is not None and b"intrinsic_matrix" in api.read_bytes(file, SourceError, api.MOST_JSON_BYTES)
+    return timed or its_own or _log_in(folder) is not None
 
 
 PLUGIN = (
@@ -191,7 +196,7 @@ PLUGIN = (
     ),
     SourceFormat(
         "plain folder", "color/ (or rgb/, images/) and depth/",
-        lambda path: api.first_subfolder(Path(path), (*api.COLOR_FOLDERS, *api.DEPTH_FOLDERS)) is not None,
+        lambda path: any(api.first_subfolder(Path(path), names) for names in KINDS) or all(_images(Path(path))),
         open_plain, priority=-1,
     ),
 )  # fmt: skip

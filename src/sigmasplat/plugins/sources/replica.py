@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import sigmasplat.api as api
-from sigmasplat.api import Calibration, SourceError
+from sigmasplat.api import SourceError
 
 CAMERA = api.published("that of Replica's renders", api.Camera(1200, 680, 600.0, 600.0, 599.5, 339.5), 6553.5)
 
@@ -21,7 +21,9 @@ def open_replica(path: str, settings: api.InputConfig) -> api.RecordedSource:
     colors, depths = _numbered(folder, "frame"), _numbered(folder, "depth")
     images, skipped = api.numbered_pairs(folder, colors, depths, "results/frame*.jpg", "results/depth*.png")
     beside = api.first_file(folder, ("cam_params.json", place.parent / "cam_params.json"))
-    known = _calibration(beside) if beside else CAMERA
+    size, units = api.first_size([pair.color for pair in images.values()]), CAMERA.depth_units_per_metre
+    if (known := api.read_intrinsics(beside, size, units) if beside else CAMERA) is None:
+        raise SourceError(f'{beside}: no "camera" object with w, h, fx, fy, cx, cy, scale')
     surface = api.first_file(place.parent, (f"{place.name}_mesh.ply", place / f"{place.name}_mesh.ply"))
     truth, units = _truth(folder / "traj.txt", [*images]), known.depth_units_per_metre
     return api.folder_source(folder, settings, [*images.values()], known, units, truth, skipped, surface=surface)
@@ -31,17 +33,6 @@ def _numbered(folder: Path, stem: str) -> dict[int, Path]:
     """Map the number in the name of each `results/<stem>NNN.*` image to its path."""
     images = api.list_images(folder / "results", (*api.COLOR_ENDINGS, ".npy"))
     return api.index_by_number(path for path in images if re.fullmatch(rf"{stem}\d+", path.stem.lower()))
-
-
-def _calibration(path: Path) -> Calibration:
-    """Read `cam_params.json`: {"camera": {w, h, fx, fy, cx, cy, scale}}. Raises SourceError."""
-    fields = api.read_json_object(path).get("camera")
-    if not isinstance(fields, dict):
-        raise SourceError(f'{path}: no "camera" object with w, h, fx, fy, cx, cy, scale')
-    w, h, *focal = (api.json_number(path, fields, key) for key in ("w", "h", "fx", "fy", "cx", "cy"))
-    camera, scale = api.build_camera(path, int(w), int(h), focal), api.positive_number(path, fields, "scale")
-    read = api.Origin("", f"read from {path.name}")
-    return Calibration(camera, scale, origins={"camera": read, "depth unit": read})
 
 
 def _truth(path: Path, numbers: list[int]) -> api.Trajectory | None:

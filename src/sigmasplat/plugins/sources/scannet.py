@@ -99,8 +99,9 @@ def _recorded(folder: Path, size: tuple[int, int], depth_size: tuple[int, int]) 
     ends = [found[name][1] if name in found else np.eye(4) for name in names[2:]]
     if not all(se3.is_rigid(T) for T in ends):
         raise SourceError(f"{folder}: the extrinsics of colour or depth are not rigid; correct or delete them")
-    T_color_depth = ends[0] @ se3.inverse(ends[1])
-    return Calibration(camera, api.MM_PER_METRE, depth_camera=depth_camera, T_color_depth=T_color_depth)
+    T_color_depth, unit = ends[0] @ se3.inverse(ends[1]), {"depth unit": api.DEFINED}
+    more: Fields = {"depth_camera": depth_camera, "T_color_depth": T_color_depth, "origins": unit}
+    return Calibration(camera, api.MM_PER_METRE, **more)
 
 
 def _camera(path: Path, K: api.Matrix, size: tuple[int, int], published: tuple[int, int]) -> api.Camera:

@@ -1,7 +1,7 @@
-"""Read the 7-Scenes sequences as published: three files per frame, depth not registered to colour.
+"""Read the 7-Scenes sequences as published: three files per frame, depth not registered to colour; and BundleFusion's
+recordings, and ScanNet's by SensReader/c++, which have the same files, and the camera in info.txt or _info.txt.
 
 seq-01/frame-000000.color.png  .depth.png  .pose.txt      (also .color.jpg); depth in mm, 0 and 65535 = no reading
-SCENE/seq-01/ seq-02/ …                                   the scene's folder, if it holds one sequence
 
 The poses are those of the depth camera. By default colour is assumed to have the same camera, as in published results;
 the error is up to some centimetres for near surfaces. With register_depth=on, depth is moved to the colour camera, and
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 import sigmasplat.api as api
-from sigmasplat.api import Camera, RecordedSource, SourceError, se3
+from sigmasplat.api import Camera, RecordedSource, se3
 
 # 585, 320, 240 are the values of the 7-Scenes page. They belong to the depth camera, and so do the published poses. The
 # colour camera and its position were fitted to the RedKitchen sequence by maximising the agreement of neighbouring
@@ -33,14 +33,14 @@ BOTH_CAMERAS = api.published(
 
 
 def open_seven_scenes(path: str, settings: api.InputConfig) -> RecordedSource:
-    """Open the folder of a sequence, or of a scene with one sequence. Raises SourceError if it cannot be used."""
-    folder = Path(path) if api.has_frame_files(Path(path)) else _only_sequence(Path(path))
-    files = api.frame_files(folder)
+    """Open the folder of a sequence. Raises SourceError if it cannot be used."""
+    folder, files = Path(path), api.frame_files(Path(path))
     images, skipped = api.numbered_pairs(
         folder, files["color"], files["depth"], "frame-*.color.png", "frame-*.depth.png"
     )
-    known = BOTH_CAMERAS if settings.register_depth == "on" else DEPTH_CAMERA
     size = api.first_size([pair.color for pair in images.values()])
+    known = api.intrinsics_beside(folder, settings, size, api.MM_PER_METRE)
+    known = known or (BOTH_CAMERAS if settings.register_depth == "on" else DEPTH_CAMERA)
     calibration = api.resolve_calibration(folder, known, size, settings, api.MM_PER_METRE)
     calibration = replace(calibration, T_color_depth=se3.orthonormalise(calibration.T_color_depth))
     truth = api.read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
@@ -51,22 +51,25 @@ def open_seven_scenes(path: str, settings: api.InputConfig) -> RecordedSource:
     return source
 
 
-def _only_sequence(scene: Path) -> Path:
-    sequences = [path for path in sorted(scene.glob("seq-*")) if path.is_dir() and api.has_frame_files(path)]
-    packed = [path.name for path in sorted(scene.glob("seq-*.zip"))]
-    if not sequences and packed:
-        raise SourceError(f"{scene}: the sequences are not unpacked ({', '.join(packed[:3])}); unzip them first")
-    if len(sequences) != 1:
-        names = ", ".join(path.name for path in sequences)
-        raise SourceError(f"{scene} holds {len(sequences)} sequences ({names}); give one, for example {sequences[0]}")
-    return sequences[0]
+def open_bundlefusion(path: str, settings: api.InputConfig) -> RecordedSource:
+    """Open a folder. Raises SourceError if images, camera or poses cannot be used."""
+    folder, files = Path(path), api.frame_files(Path(path))
+    images, skipped = api.numbered_pairs(folder, files["color"], files["depth"], "frame-*.color.*", "frame-*.depth.*")
+    path_m = api.read_pose_files((i.timestamp_s, files["pose"][n]) for n, i in images.items() if n in files["pose"])
+    return api.folder_source(
+        folder, settings, [*images.values()], None, api.MM_PER_METRE, path_m, skipped, one_camera=True, estimated=True
+    )  # fmt: skip
+
+
+def _has_info(path: str) -> bool:
+    return api.first_file(Path(path), ("_info.txt", "info.txt")) is not None and api.has_frame_files(Path(path))
 
 
 def _recognises(path: str) -> bool:
-    folder = Path(path)
-    if api.has_frame_files(folder):
-        return not any((folder / name).is_file() for name in ("_info.txt", "info.txt"))
-    return any(api.has_frame_files(entry) or entry.suffix == ".zip" for entry in folder.glob("seq-*"))
+    return api.has_frame_files(Path(path)) and not _has_info(path)
 
 
-PLUGIN = api.SourceFormat("7-Scenes", "frame-*.color.png", _recognises, open_seven_scenes, sensor="kinect-v1")
+PLUGIN = (
+    api.SourceFormat("7-Scenes", "frame-*.color.png", _recognises, open_seven_scenes, sensor="kinect-v1"),
+    api.SourceFormat("BundleFusion", "frame-*.color.jpg and info.txt", _has_info, open_bundlefusion),
+)

@@ -12,6 +12,7 @@ DatasetEncoder.swift). Recordings of 2021, whose odometry.csv has no header, are
 """
 
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,7 @@ def open_stray_scanner(path: str, settings: api.InputConfig) -> api.RecordedSour
     skipped = [f"{depths[n]}: no frame {n} in rgb.mp4 or odometry.csv" for n in sorted({*depths} - {*numbers})]
     used, (moved_s, rates, forces) = [rows[n] for n in numbers], _imu(folder / "imu.csv")
     times_s, known = np.array([row["timestamp"] for row in used]), _calibration(folder, used, video.size)
+    known = known and replace(known, origins={**known.origins, "depth unit": api.DEFINED})
     truth, gyroscope = _truth(times_s, used), api.gyroscope_from_samples(moved_s, rates)
     if gyroscope and not gyroscope.measured_any(times_s):
         gyroscope = None
@@ -90,14 +92,9 @@ def _calibration(folder: Path, rows: list[dict[str, float]], size: api.Size) -> 
     path, focals = folder / "camera_matrix.csv", [[row[name] for name in INTRINSICS if name in row] for row in rows]
     if len(focals[0]) == len(INTRINSICS):
         return api.median_calibration(folder / "odometry.csv", size, np.array(focals), api.MM_PER_METRE)
-    return Calibration(api.build_camera(path, *size, _matrix(path)), api.MM_PER_METRE) if path.is_file() else None
-
-
-def _matrix(path: Path) -> list[float]:
-    rows = [api.parse_numbers(path, line, words) for line, words in api.read_lines(path)]
-    if [len(row) for row in rows] != [3, 3, 3]:
-        raise SourceError(f"{path}: expected a 3×3 matrix, found rows of {[len(row) for row in rows]}; copy it again")
-    return [rows[0][0], rows[1][1], rows[0][2], rows[1][2]]
+    if path.is_file() and not (known := api.read_intrinsics(path, size, api.MM_PER_METRE)):
+        raise SourceError(f"{path}: expected a 3×3 matrix; copy it again")
+    return known if path.is_file() else None
 
 
 def _truth(times_s: NDArray[np.float64], rows: list[dict[str, float]]) -> Trajectory:

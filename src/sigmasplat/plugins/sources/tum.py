@@ -3,6 +3,7 @@ TUM-compatible sequences, and other folders with an association file.
 
 rgb.txt  depth.txt  groundtruth.txt     lines of "t path" or "t tx ty tz qx qy qz qw", comments after #
 calibration.json                        optional: fx fy cx cy width height depth_scale [distortion]
+trans_matrix.yaml                       OpenLORIS's: transforms from the robot's base, whose poses are the truth
 gyroscope.txt                           optional: "t wx wy wz", rad/s about the camera's x, y, z (right, down, forward)
 
 Bonn (recognised by `bonn` in the folder's path) has the same lists, another camera, and ground truth of the motion
@@ -22,6 +23,7 @@ mirrored world. With F = diag(1, −1, 1, 1), T_ours = F · T · F is its reflec
 """
 
 import json
+import re
 from contextlib import AbstractContextManager
 from dataclasses import asdict, replace
 from functools import partial
@@ -33,6 +35,7 @@ from PIL import Image
 
 import sigmasplat.api as api
 from sigmasplat.api import Camera, Gyroscope, ImagePair, InputConfig, Origin, RunError, SourceError, SourceFormat, se3
+from sigmasplat.plugins.sources.bag_cameras import chained
 
 COLOR_LISTS, DEPTH_LISTS = ("rgb.txt", "color.txt"), ("aligned_depth.txt", "depth.txt")
 """The second name of colour, and the first of depth, are OpenLORIS's, whose depth is in millimetres."""
@@ -60,7 +63,7 @@ def open_tum(path: str, settings: InputConfig, bonn: bool = False) -> api.Record
         + " (used by another image)" * bool(gaps_s[i] < settings.max_gap_s)
         for i in alone
     ]
-    truth = api.read_groundtruth(folder)
+    truth = _of_color(folder, api.read_groundtruth(folder))
     if bonn and truth:
         truth = api.Trajectory(truth.timestamps_s, T_ROS @ truth.T_world_camera @ T_ROS @ T_MARKERS_CAMERA)
     known = BONN if bonn else api.freiburg_calibration(folder)
@@ -71,6 +74,20 @@ def open_tum(path: str, settings: InputConfig, bonn: bool = False) -> api.Record
         folder, settings, images, known, units, truth, skipped, gyroscope=gyroscope,
         origins=api.time_origins(settings, "by time", "read from their lists"),
     )  # fmt: skip
+
+
+def _of_color(folder: Path, truth: api.Trajectory | None) -> api.Trajectory | None:
+    """Return the path of OpenLORIS's colour camera, given that of the robot's base; others as they are."""
+    path, edges = folder / "trans_matrix.yaml", dict[str, dict[str, api.Matrix]]()
+    if truth is None or not path.is_file():
+        return truth
+    pattern = r"(?s)parent_frame:\s*(\S+)\s+child_frame:\s*(\S+).*?data:\s*\[([^]]*)"
+    for parent, child, numbers in re.findall(pattern, api.read_text(path)):
+        T = api.to_matrix(f"{path}: {child}", [float(number) for number in numbers.split(",")])
+        edges.setdefault(parent, {})[child], edges.setdefault(child, {})[parent] = T, se3.inverse(T)
+    if (T_base_color := chained(edges, "base_link", "d400_color_optical_frame")) is None:
+        raise SourceError(f"{path}: no transform from base_link to d400_color_optical_frame; copy it again")
+    return api.Trajectory(truth.timestamps_s, truth.T_world_camera @ T_base_color)
 
 
 def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
@@ -88,7 +105,7 @@ def _depth_list(folder: Path) -> tuple[NDArray[np.float64], list[Path]]:
 def read_list(path: Path) -> tuple[NDArray[np.float64], list[Path]]:
     """Read "t path" lines: timestamps [N] seconds and image paths. Raises SourceError naming file and line."""
     lines = list(api.read_listed(path, "timestamp path"))
-    return np.array([t for (t,), _ in lines]), [file for _, (file,) in lines]
+    return api.dated_seconds(np.array([t for (t,), _ in lines])), [file for _, (file,) in lines]
 
 
 def read_gyroscope(path: Path) -> Gyroscope:
@@ -165,7 +182,8 @@ T_MARKERS_CAMERA = se3.orthonormalise(
 
 
 ICL_NUIM = api.published("that of ICL-NUIM", Camera(640, 480, 481.2, 480.0, 319.5, 239.5), api.TUM_UNITS_PER_METRE)
-LIST_NAMES = ("associations.txt", "association.txt", "associate.txt")
+STEMS = "associations", "association", "associate", "associated", "assoc", "associate_with_groundtruth"
+LIST_NAMES = tuple(f"{stem}.txt" for stem in STEMS)
 MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
