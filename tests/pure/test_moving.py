@@ -9,18 +9,24 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from paper_settings import MovingConfig
+from sigmasplat.config import RenderConfig
 from sigmasplat.data.camera import Camera
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.frame import Frame
+from sigmasplat.data.submap import Picture
 from sigmasplat.errors import SourceError
+from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe, Target
 from sigmasplat.mapping.moving import carve, mask_keyframes
 from sigmasplat.plugins.sources import SyntheticRoom, open_source
+from sigmasplat.render.backend import make_view
 from sigmasplat.tracking.moving.dynamic_detector import DynamicDetector
 from sigmasplat.tracking.moving.dynamic_mask import DynamicMask
+from sigmasplat.tracking.prepared_frame import PreparedFrame
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 WALL_M, BOX_M, FRAMES = 3.0, 1.0, 30
+VIEW = make_view("cpu", CAMERA, RenderConfig())
 
 
 def with_box(left: int) -> NDArray[np.float32]:
@@ -94,6 +100,24 @@ def test_a_stray_splat_is_not_taken_for_a_thing_that_has_gone(floating: int, lef
     field = GaussianField.from_values(points, torch.full_like(points, 0.02), torch.full_like(points, 0.5))
     carve(field, [keyframe(n, with_box(200)) for n in (0, 5, 10)], votes=3)
     assert len(field) == left
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0])
+def test_what_a_distance_means_grows_with_the_scene(scale: float) -> None:
+    """A step of 8 cm at 1 m shows nothing that moves, nor one of 80 cm at 10 m in a scene ten times as large."""
+    near, far = with_box(60), with_box(200)
+    for depth_m in (near, far):
+        depth_m[:] = np.where(depth_m == BOX_M, scale, 1.08 * scale)
+    frames, config = [keyframe(0, near), keyframe(5, far)], MovingConfig(find=True, still_frames=FRAMES)
+    mask_keyframes(frames, config, scale)
+    assert not any(masked(frame).any() for frame in frames)
+    points = torch.tensor([(0.0, 0.0, scale)] * 100)
+    field = GaussianField.from_values(points, torch.full_like(points, 0.02), torch.full_like(points, 0.5))
+    carve(field, [keyframe(n, far) for n in (0, 5, 10)], 3, scale)
+    assert len(field) == len(points)
+    before, live = (PreparedFrame.of_picture(Picture(np.zeros((120, 160, 3), np.uint8), z), VIEW) for z in (near, far))
+    reference = Reference(before.live, np.eye(4))
+    assert DynamicDetector(config, scale).without_gone(reference, live, np.eye(4)) is reference
 
 
 def test_nothing_moves_in_noise() -> None:

@@ -15,7 +15,6 @@ from sigmasplat.config.text import override
 from sigmasplat.data.frame import Frame
 from sigmasplat.plugins.sources import open_source
 from sigmasplat.system.slam import Slam
-from sigmasplat.tracking.moving.dynamic_mask import share_of
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -36,7 +35,7 @@ def test_nothing_is_in_front(data_folder: Callable[[str], Path], seed: int) -> N
     slam, random = Slam(override(preset("sigma"), LITTLE)), np.random.default_rng(seed)
     source, hidden = open_source(str(data_folder("fr1_xyz"))), []
     for index, number in enumerate(range(260, 290, 3)):
-        slam.step(replace(blurred(source.frame(number), random), index=index))
-        hidden.append(share_of(slam.tracker.front))
+        step = slam.step(replace(blurred(source.frame(number), random), index=index))
+        hidden.append(step.tracking["moving"])
     assert {step.state for step in slam.steps} == {"tracked"}
     assert not any(hidden), hidden

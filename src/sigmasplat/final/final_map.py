@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sigmasplat.config import Config, FinalConfig, MovingConfig
+from sigmasplat.config import Config, FinalConfig
 from sigmasplat.data import se3
 from sigmasplat.data.field import COLUMNS, GaussianField
 from sigmasplat.data.mesh import Mesh
@@ -59,10 +59,11 @@ def final_map(
     """
     seed = seeded_on_surface if config.final.seed_from == "mesh" else merged
     if config.moving.find:
-        store = without_moving(store, anchors, config.moving)
+        store = without_moving(store, anchors, config)
     field, keyframes = seed(store, anchors, config), KeyframeReader(store, anchors, view)
     if config.moving.find:  # remove splats from space that the keyframes of all submaps see to be free
-        remove(field, is_free(field.means.numpy(), keyframes, config.moving.carve_votes))
+        votes, scale = config.moving.carve_votes, config.render.scene_scale
+        remove(field, is_free(field.means.numpy(), keyframes, votes, scale))
     if not config.final.iterations:
         return FinalMap(field)
     field.keep(torch.from_numpy(z_order(field.means.numpy())))
@@ -263,18 +264,22 @@ class StillStore(RefinedStore):
         self.hidden[place] = bits | self.hidden.get(place, bits)
 
 
-def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: MovingConfig) -> StillStore:
+def without_moving(store: SubmapStore, anchors: Sequence[Matrix], config: Config) -> StillStore:
     """Return the store with what moves masked in its keyframes; anchors: T_world_submap [4, 4] of each submap."""
-    still, places = StillStore(store), [(s, k) for s in range(len(store)) for k in range(len(store.load(s).frames))]
-    poses = [anchors[s] @ T for s in range(len(store)) for T in store.load(s).T_submap_camera]
-    frames = [frame for s in range(len(store)) for frame in store.load(s).frames]
-    camera = store.load(0).camera
+    still, most = StillStore(store), config.moving.still_frames
+    places, poses, frames = list[KeyframeId](), list[Matrix](), list[int]()
+    for s, anchor in enumerate(anchors):
+        submap = store.load(s)
+        places += [(s, k) for k in range(len(submap.frames))]
+        poses += [anchor @ T for T in submap.T_submap_camera]
+        frames += submap.frames
     for late, others in enumerate(_compared(poses)):
         for early in others:
-            close = frames[late] - frames[early] <= config.still_frames or not config.still_frames
+            close = frames[late] - frames[early] <= most or not most
             for own, other in ((early, late), (late, early))[: 1 + close]:
                 own_m, other_m = (still.picture(*places[n]).depth_m for n in (own, other))
-                pixels = contradicted(own_m, other_m, se3.inverse(poses[other]) @ poses[own], camera)
+                T_other_own = se3.inverse(poses[other]) @ poses[own]
+                pixels = contradicted(own_m, other_m, T_other_own, submap.camera, config.render.scene_scale)
                 if pixels is not None:
                     still.hide(places[own], pixels)
     return still

@@ -31,10 +31,14 @@ class Reference:
     pyramid: Pyramid
     T_camera_world: Matrix
 
+    @property
+    def depth_m(self) -> Image:
+        """Return the depth [H, W], m, in host memory."""
+        return self.pyramid.kernels.to_host(self.pyramid.depth[0])
+
     def without(self, hidden: NDArray[np.bool_]) -> "Reference":
         """Return the reference without depth at some pixels [H, W], so that nothing is aligned to them."""
-        host_m = self.pyramid.kernels.to_host(self.pyramid.depth[0])
-        return replace(self, pyramid=self.pyramid.with_depth(np.where(hidden, np.float32(0.0), host_m)))
+        return replace(self, pyramid=self.pyramid.with_depth(np.where(hidden, np.float32(0.0), self.depth_m)))
 
     def moved_by(self, T_new_old: Matrix) -> "Reference":
         """Return the reference with its pose in other coordinates [4, 4]."""

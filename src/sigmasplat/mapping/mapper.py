@@ -170,10 +170,10 @@ class Mapper:
 
     def _leave_out_moving(self) -> None:
         """Mask what moves in the newest keyframe and has gone from earlier ones, and remove splats from free space."""
-        c = self.config.moving
+        c, scale = self.config.moving, self.config.render.scene_scale
         if c.find:
-            mask_keyframes(self.keyframes, c)
-            carve(self.field, self.keyframes[-RECENT:], c.carve_votes)
+            mask_keyframes(self.keyframes, c, scale)
+            carve(self.field, self.keyframes[-RECENT:], c.carve_votes, scale)
 
     def _window(self, view: View) -> list[Keyframe]:
         """Return the keyframes to fit, the newest first; all of them if `mapping.window` is 0."""

@@ -12,7 +12,6 @@ from sigmasplat.data.trajectory import APART, LOST, STATES, TRACKED
 from sigmasplat.graph.confidence import compared, off_probability
 from sigmasplat.graph.loops import Loop
 from sigmasplat.render.view import View
-from sigmasplat.tracking.moving.dynamic_mask import share_of
 from sigmasplat.tracking.newest_frame import FrameEstimate
 from sigmasplat.tracking.pose_validation import LOST as LIKELY_WRONG, diagnosis
 from sigmasplat.tracking.prepared_frame import PreparedFrame
@@ -77,9 +76,9 @@ def make_step(
     """Return the result of a frame; submap: the active one; waiting: number of keyframes that wait to be mapped, on two
     clocks."""
     state = APART if submap.component and estimate.state != LOST else estimate.state
-    tracking = estimate.logged() | {
-        "doubtful": float(tracker.doubtful), "depth_noise": tracker.statistics.noise,
-    } | ({} if waiting is None else {"waiting": float(waiting)}) | {"moving": share_of(tracker.front)}  # fmt: skip
+    tracking = estimate.logged() | {"doubtful": float(tracker.doubtful), "depth_noise": tracker.statistics.noise}
+    tracking |= {} if waiting is None else {"waiting": float(waiting)}
+    tracking["moving"] = 0.0 if tracker.front is None else float(tracker.front.hidden.mean())
     p_off = off_probability(state, tracking)
     return Step(
         seen.frame.index, seen.frame.timestamp_s, submap.T_world_submap @ estimate.T_submap_camera, estimate.mapped,

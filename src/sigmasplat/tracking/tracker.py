@@ -62,7 +62,8 @@ class Tracker:
     def of(config: Config, extractor: Extractor | None) -> "Tracker":
         """Return the tracker of a run; the extractor is left out if tracking uses no features."""
         features = extractor if config.tracking.features else None
-        return Tracker(config.tracking, features, detector=DynamicDetector(config.moving))
+        detector = DynamicDetector(config.moving, config.render.scene_scale)
+        return Tracker(config.tracking, features, detector=detector)
 
     def start(self, seen: PreparedFrame) -> None:
         """Fix the gauge: the first camera is the world."""
@@ -134,11 +135,13 @@ class Tracker:
     ) -> tuple[PoseFit, PreparedFrame] | None:
         """Return the fit and the frame without what is in space that was free, or None; before: in front in the last
         frame. The newest keyframe loses what has left it."""
-        known = before or self.keyframe_front
-        if fit.comparison is None or not self.detector.suspects(fit.comparison, known, given.should_stop):
+        keyframe, known = self.keyframe, before or self.keyframe_front
+        if keyframe is None or fit.comparison is None:
+            return None
+        if not self.detector.suspects(fit.comparison, known, given.should_stop):
             return None
         # the expected pose of a fast camera is centimetres off: it is used only if something may have pulled the fit
-        keyframe, predicted = self.keyframe, given.prediction.predicted
+        predicted = given.prediction.predicted
         pose = predicted if self._doubts(fit) else se3.inverse(fit.T_camera_world)
         front = self.detector.in_front(keyframe, self.keyframe_front, before, self.previous, seen, pose)
         if front is not None and known is None and is_scene(front, seen.target.depth_image.numpy()):

@@ -14,20 +14,19 @@ from sigmasplat.tracking.moving.dynamic_mask import (
     LEAST_REGION,
     DynamicMask,
     Earlier,
+    coarse_step,
     dynamic_mask,
     enlarged,
     seen_again,
     smooth,
 )
-from sigmasplat.tracking.moving.free_space import Depth, labelled, widened
+from sigmasplat.tracking.moving.free_space import CLEAR_M, Depth, labelled, widened
 from sigmasplat.tracking.moving.pose_pullers import is_scene
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.types import Matrix, ShouldStop
 
 EVERY = 5
 """Every fifth frame is remembered."""
-COLUMNS_TESTED = 80
-"""About so many columns of an image are tested."""
 AT_REST, KNOWN = 0.85, 0.3
 """A region is at rest if this share of it was seen at the same place before, and at least this share is known."""
 
@@ -51,9 +50,10 @@ RENEWED = 0.7
 @dataclass(frozen=True, eq=False)
 class DynamicDetector:
     """What is known of moving things between two frames: the number of frames since the camera was found, and what some
-    recent ones saw, the newest last; nothing without `config.find`."""
+    recent ones saw, the newest last; nothing without `config.find`. scene_scale: of the scene relative to a room."""
 
     config: MovingConfig = field(default_factory=MovingConfig)
+    scene_scale: float = 1.0
     frames: int = 0
     recent: tuple[RememberedDepth, ...] = ()
 
@@ -61,52 +61,46 @@ class DynamicDetector:
         """Return whether something may be in front of the scene, or may have left its place in it; known: what was
         in front in the last frame or in the newest keyframe. If the next frame waits (`should_stop`), only what is in
         front is looked for."""
-        return (
-            known is not None
-            or found.front >= FRONT
-            or (self.config.find and found.behind >= FRONT and not should_stop())
-        )
+        seen_through = self.config.find and found.behind >= FRONT and not should_stop()
+        return known is not None or found.front >= FRONT or seen_through
+
+    def _earlier(self, depth_m: Depth, T_earlier_live: Matrix) -> Earlier:
+        return Earlier(depth_m, T_earlier_live, CLEAR_M * self.scene_scale)
 
     def in_front(
-        self, keyframe: Reference | None, keyframe_front: DynamicMask | None, last: DynamicMask | None,
+        self, keyframe: Reference, keyframe_front: DynamicMask | None, last: DynamicMask | None,
         T_world_last: Matrix, seen: PreparedFrame, T_world_camera: Matrix,
     ) -> DynamicMask | None:  # fmt: skip
         """Find what is in front of the scene at a pose: in places that the newest keyframe saw to be free.
 
         keyframe_front, last: what was in front in the newest keyframe and in the last frame, whose pose is given.
         """
-        if keyframe is None:
-            return None
-        depth = keyframe.pyramid.depth[0]
-        scene_m = keyframe.pyramid.kernels.to_host(depth) if keyframe_front is None else keyframe_front.scene_m
-        scene, target = Earlier(scene_m, keyframe.T_camera_world @ T_world_camera), seen.target
+        scene_m = keyframe.depth_m if keyframe_front is None else keyframe_front.scene_m
+        scene = self._earlier(scene_m, keyframe.T_camera_world @ T_world_camera)
         before = None if last is None else Earlier(last.depth_m, se3.inverse(T_world_last) @ T_world_camera)
-        live_m, scale = target.depth_image.numpy(), keyframe.pyramid.scene_scale
-        return dynamic_mask(scene, before, live_m, target.camera, self.config.find, scene_scale=scale)
+        return dynamic_mask(scene, before, seen.target.depth_image.numpy(), seen.target.camera, self.config.find)
 
-    def without_gone(self, keyframe: Reference | None, seen: PreparedFrame, T_world_camera: Matrix) -> Reference | None:
+    def without_gone(self, keyframe: Reference, seen: PreparedFrame, T_world_camera: Matrix) -> Reference:
         """Return the newest keyframe without what has moved away since, at a pose of the live camera."""
-        if keyframe is None or not self.config.find:
+        if not self.config.find:
             return keyframe
-        depth_m, live_m = keyframe.pyramid.kernels.to_host(keyframe.pyramid.depth[0]), seen.target.depth_image.numpy()
-        live = Earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
+        depth_m, live_m = keyframe.depth_m, seen.target.depth_image.numpy()
+        live = self._earlier(live_m, se3.inverse(keyframe.T_camera_world @ T_world_camera))
         gone = dynamic_mask(live, None, depth_m, seen.target.camera, whole_objects=True)
         return keyframe if gone is None or is_scene(gone, depth_m) else keyframe.without(gone.hidden)
 
     def renews(self, found: Comparison | None, front: DynamicMask | None) -> bool:
         """Return whether a frame with something in front becomes a keyframe: it shares too little with the newest."""
-        if not self.config.find or front is None or found is None:
-            return False
-        return min(found.common, found.covered) < RENEWED
+        looks = self.config.find and front is not None
+        return looks and found is not None and min(found.common, found.covered) < RENEWED
 
     def after(self, depth_m: Depth, T_world_camera: Matrix) -> "DynamicDetector":
         """Return what is known after a frame with this depth [H, W], m, that is not lost."""
         if not self.config.find:
             return self
-        if self.frames % EVERY:
-            return replace(self, frames=self.frames + 1)
-        recent = (*self.recent, RememberedDepth(self.frames, depth_m, T_world_camera))
-        return replace(self, frames=self.frames + 1, recent=recent[-(self.config.still_frames // EVERY + 1) :])
+        new = () if self.frames % EVERY else (RememberedDepth(self.frames, depth_m, T_world_camera),)
+        kept = self.config.still_frames // EVERY + 1
+        return replace(self, frames=self.frames + 1, recent=(*self.recent, *new)[-kept:])
 
     def still_moving(
         self, front: DynamicMask | None, depth_m: Depth, T_world_camera: Matrix, camera: Camera
@@ -117,13 +111,13 @@ class DynamicDetector:
         before = [k for k, earlier in enumerate(self.recent) if self.frames - earlier.number >= frames]
         if front is None or not self.config.find or not frames or not before:
             return front
-        step = max(2, camera.width // COLUMNS_TESTED)
+        step = coarse_step(camera)
         depth = np.where(front.depth_m > 0, depth_m, np.float32(0.0))[::step, ::step]
         regions, boxes = labelled(smooth(depth))
         count = len(boxes)
         rests = np.ones(count + 1, np.bool_)
         for earlier in self.recent[before[-1] :]:  # what comes back to an earlier place has not rested there
-            scene = Earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
+            scene = self._earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
             known, same = seen_again(scene, depth, camera, step)
             sizes, of_known, of_same = (
                 np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)
@@ -135,7 +129,7 @@ class DynamicDetector:
         moving = widened((regions > 0) & ~rests[regions], 3)
         if moving.sum() < LEAST_REGION * moving.size:
             return None
-        whole, hidden = enlarged(moving, step, depth_m)
+        whole, hidden = enlarged(moving, depth_m, step)
         whole, hidden = whole & (front.depth_m > 0), hidden & front.hidden
         depths = np.where(whole, front.depth_m, np.float32(0.0)), np.where(hidden, front.scene_m, depth_m)
         return DynamicMask(hidden, *depths)
@@ -146,5 +140,5 @@ class DynamicDetector:
         return replace(self, recent=recent)
 
     def cleared(self) -> "DynamicDetector":
-        """Return the detector with nothing remembered."""
-        return DynamicDetector(self.config)
+        """Return the same with nothing remembered."""
+        return DynamicDetector(self.config, self.scene_scale)

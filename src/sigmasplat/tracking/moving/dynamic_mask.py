@@ -30,8 +30,9 @@ from sigmasplat.tracking.moving.free_space import (
 )
 from sigmasplat.types import Matrix
 
-STEP = 2
-"""Every second row and column of the live image is tested, unless another step is given."""
+STEP, COLUMNS_TESTED = 2, 80
+"""Every second row and column of the live image is tested; of images that are tested against many others, about so many
+columns (`coarse_step`)."""
 POSE_ERROR = 0.05
 """This share of the motion between both images is added to the window on each side: motion blur and calibration errors
 grow with the motion."""
@@ -62,20 +63,17 @@ class DynamicMask:
     scene_m: Depth
 
 
-def share_of(front: DynamicMask | None) -> float:
-    """Return the share of the image that is in front."""
-    return 0.0 if front is None else float(front.hidden.mean())
-
-
 @dataclass(frozen=True, eq=False)
 class Earlier:
     """Depth of an earlier image [H, W] m, 0 where it is not known, and its pose relative to a live camera, [4, 4].
 
-    further_px: windows are larger by so many pixels on each side.
+    clear_m: surfaces are apart if they differ by so much plus a share of their depth; further_px: windows are larger by
+    so many pixels on each side.
     """
 
     depth_m: Depth
     T_earlier_live: Matrix
+    clear_m: float = CLEAR_M
     further_px: int = 0
 
     @property
@@ -103,36 +101,33 @@ def coarse_rays(camera: Camera, step: int) -> Matrix:
     return camera.rays()[::step, ::step].astype(np.float64)
 
 
-@lru_cache(maxsize=8)
-def _columns_of_rays(camera: Camera, step: int) -> Depth:
-    """Return the same rays as columns [3, h · w], float32."""
-    return np.ascontiguousarray(coarse_rays(camera, step).reshape(-1, 3).T, np.float32)
+def coarse_step(camera: Camera) -> int:
+    """Return the step between the columns that are tested of images that are tested against many others."""
+    return max(STEP, camera.width // COLUMNS_TESTED)
 
 
-def thinned(live_m: Depth, step: int) -> Depth:
+def thinned(live_m: Depth, step: int = STEP) -> Depth:
     """Return every `step`-th row and column of depth [H, W], m, without its scattered holes."""
     depth = live_m[::step, ::step]
     return np.where(depth > 0, depth, largest_around(depth, 3))
 
 
 def dynamic_mask(
-    scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera, whole_objects: bool = False,
-    step: int = STEP, scene_scale: float = 1.0,
-) -> DynamicMask | None:  # fmt: skip
+    scene: Earlier, before: Earlier | None, live_m: Depth, camera: Camera, whole_objects: bool = False, step: int = STEP
+) -> DynamicMask | None:
     """Find what has moved in front of the camera; None without.
 
     scene: the reference; before: what was in front in the last image; live_m [H, W]: live depth, m. A whole region
     between depth steps is in front, also its part whose place the reference did not see, but not pixels that fit to the
     reference. With `whole_objects` these belong to it too, if the region is an object by itself: something that has
     moved by less than its size covers its own earlier place. step: of the rows and columns that are tested.
-    scene_scale: size of the scene relative to a room.
     """
-    depth, clear_m = thinned(live_m, step), CLEAR_M * scene_scale
+    depth = thinned(live_m, step)
     scene = scene.within_error(depth, camera)
-    free = _free(scene, depth, camera, step, clear_m)
+    free = _free(scene, depth, camera, step)
     if before is None and np.count_nonzero(free) < LEAST_REGION * depth.size:
         return None
-    again, same = _places(scene, before, depth, free, camera, step, clear_m)
+    again, same = _places(scene, before, depth, free, camera, step)
     if np.count_nonzero(free | again) < LEAST_REGION * depth.size:
         return None
     inside = smooth(depth)
@@ -141,7 +136,7 @@ def dynamic_mask(
         moved |= _regions(inside, free, again, whole_objects=True)
     if not moved.any():
         return None
-    whole, hidden = enlarged(moved, step, live_m, whole_objects)
+    whole, hidden = enlarged(moved, live_m, step, whole_objects)
     return DynamicMask(
         hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera, hidden), live_m)
     )
@@ -153,15 +148,15 @@ def smooth(depth: Depth) -> Mask:
     return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
 
 
-def enlarged(small: Mask, step: int, live_m: Depth, whole_objects: bool = True) -> tuple[Mask, Mask]:
+def enlarged(small: Mask, live_m: Depth, step: int = STEP, whole_objects: bool = True) -> tuple[Mask, Mask]:
     """Return a mask of every `step`-th pixel at the size of the image, and the same with a margin and with the holes in
     depth that it surrounds: what is too near for the sensor has no reading, but hides the scene too. whole_objects:
     what is as far as the edge of such a hole belongs to the same thing."""
-    whole, hidden = with_margin(small, step, live_m)
+    whole, hidden = with_margin(small, live_m, step)
     return whole, hidden | _holes_in(hidden, whole if whole_objects else None, live_m)
 
 
-def with_margin(small: Mask, step: int, live_m: Depth) -> tuple[Mask, Mask]:
+def with_margin(small: Mask, live_m: Depth, step: int = STEP) -> tuple[Mask, Mask]:
     """Return the same without the holes."""
     whole = np.repeat(np.repeat(small, step, 0), step, 1)[: live_m.shape[0], : live_m.shape[1]]
     return whole, widened(whole, 2 * MARGIN_PX + 1)
@@ -219,15 +214,15 @@ def _behind(scene: Earlier, camera: Camera, hidden: Mask) -> Depth:
     return np.where(seen > 0, seen, largest_around(seen, 3))
 
 
-def _free(scene: Earlier, depth: Depth, camera: Camera, step: int, clear_m: float) -> Mask:
+def _free(scene: Earlier, depth: Depth, camera: Camera, step: int) -> Mask:
     """Return which pixels of every `step`-th row and column are in places that were free."""
-    points_m = _columns_of_rays(camera, step) * depth.reshape(-1)
-    free = free_places(points_m, scene.T_earlier_live, scene.depth_m, camera, clear_m, scene.further_px)
+    points_m = np.ascontiguousarray(coarse_rays(camera, step).reshape(-1, 3).T, np.float32) * depth.reshape(-1)
+    free = free_places(points_m, scene.T_earlier_live, scene.depth_m, camera, scene.clear_m, scene.further_px)
     return np.asarray(free & (points_m[2] > 0)).reshape(depth.shape)
 
 
 def _places(
-    scene: Earlier, before: Earlier | None, depth: Depth, free: Mask, camera: Camera, step: int, clear_m: float
+    scene: Earlier, before: Earlier | None, depth: Depth, free: Mask, camera: Camera, step: int
 ) -> tuple[Mask, Mask]:
     """Return which of the pixels that are not in free places are where something was in front already, and which of the
     rest are on surfaces of the scene."""
@@ -235,12 +230,12 @@ def _places(
     points = coarse_rays(camera, step)[v, u].T * depth[v, u]
     far = scene.far_m
     inside, row, column, z = projected(points, camera, scene.T_earlier_live)
-    known, limit = inside & (far[row, column] > 0), clear_m + CLEAR_RELATIVE * z
+    known, limit = inside & (far[row, column] > 0), scene.clear_m + CLEAR_RELATIVE * z
     again, same = np.zeros((2, *depth.shape), bool)
     if before is not None:
         in_last, at_row, at_column, z_last = projected(points, camera, before.T_earlier_live)
         front = before.depth_m[at_row, at_column]
-        again[v, u] = in_last & (front > 0) & (z_last < front + clear_m + CLEAR_RELATIVE * z_last)
+        again[v, u] = in_last & (front > 0) & (z_last < front + scene.clear_m + CLEAR_RELATIVE * z_last)
     same[v, u] = known & (z < far[row, column] + limit)
     return again, same & ~again
 
@@ -251,7 +246,7 @@ def seen_again(scene: Earlier, depth: Depth, camera: Camera, step: int) -> tuple
     v, u = np.nonzero(depth > 0)
     points = coarse_rays(camera, step)[v, u].T * depth[v, u]
     inside, row, column, z = projected(points, camera, scene.T_earlier_live)
-    (near, far), limit = (plane[row, column] for plane in scene.range_m), CLEAR_M + CLEAR_RELATIVE * z
+    (near, far), limit = (plane[row, column] for plane in scene.range_m), scene.clear_m + CLEAR_RELATIVE * z
     known, same = np.zeros((2, *depth.shape), bool)
     known[v, u] = inside & (far > 0) & (z < far + limit)  # what is farther was hidden
     same[v, u] = known[v, u] & (z > near - limit)

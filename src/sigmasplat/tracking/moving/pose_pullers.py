@@ -15,15 +15,7 @@ from scipy.special import fdtri
 from sigmasplat.data import se3
 from sigmasplat.fit.align import Alignment, normal_equations
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.tracking.moving.dynamic_mask import (
-    EDGE_RELATIVE,
-    STEP,
-    DynamicMask,
-    enlarged,
-    smooth,
-    thinned,
-    with_margin,
-)
+from sigmasplat.tracking.moving.dynamic_mask import EDGE_RELATIVE, DynamicMask, enlarged, smooth, thinned, with_margin
 from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
 from sigmasplat.tracking.pose_validation import wrong_odds
 from sigmasplat.tracking.prepared_frame import PreparedFrame
@@ -48,8 +40,8 @@ def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
     if fit.alignment is None:
         return
     live_m = seen.target.depth_image.numpy()
-    for inside in free_standing(thinned(live_m, STEP)):
-        if rest_disagrees(fit.alignment, with_margin(inside, STEP, live_m)[1]):
+    for inside in free_standing(thinned(live_m)):
+        if rest_disagrees(fit.alignment, with_margin(inside, live_m)[1]):
             thing = thing_of(inside, live_m)
             if not is_scene(thing, live_m):
                 yield thing
@@ -57,7 +49,7 @@ def suspected(seen: PreparedFrame, fit: PoseFit) -> Iterator[DynamicMask]:
 
 def thing_of(inside: Mask, live_m: Depth) -> DynamicMask:
     """Return what stands free, from its pixels in `thinned` depth; what is behind it is not known."""
-    whole, hidden = enlarged(inside, STEP, live_m)
+    whole, hidden = enlarged(inside, live_m)
     return DynamicMask(hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, np.float32(0.0), live_m))
 
 
