@@ -11,6 +11,7 @@ from sigmasplat.data.poses import Column, Place, Places
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.data.submap import MemoryStore, Picture, Submap
 from sigmasplat.final.stores import RefinedStore, StorePart
+from sigmasplat.system.array_interface import correction_since
 
 CAMERA = Camera(4, 3, 4.0, 4.0, 1.5, 1.0)
 
@@ -56,6 +57,17 @@ def test_a_frame_follows_its_keyframe() -> None:
     moved = motion(5)
     atlas.keyframe_poses[1][1] = moved @ atlas.keyframe_poses[1][1]
     assert np.allclose(atlas.T_world_camera()[3], atlas.anchors[1] @ moved @ se3.inverse(atlas.anchors[1]) @ world[3])
+
+
+def test_a_correction_leaves_out_a_frame_that_has_become_a_keyframe_since() -> None:
+    atlas, _ = two_submaps()
+    before, new = atlas.copied(), motion(3)
+    atlas.set_keyframes([*atlas.keyframe_poses.last, new], RelativePose.hop(np.eye(4)))
+    atlas.place_again(new)  # of a sensor that reads late: it is mapped with the next frame
+    atlas.place_frame(motion(4))
+    atlas.anchors[1] = motion(7) @ atlas.anchors[1]
+    correction = correction_since(before, atlas)
+    assert correction is not None and correction.reason == "loop" and correction.frames.tolist() == [2]
 
 
 def test_hops_to_keyframes_are_read_as_they_were_set() -> None:

@@ -18,6 +18,7 @@ from sigmasplat.data.submap import MemoryStore
 from sigmasplat.realtime.system import RealTime
 from sigmasplat.run.resume import CLASSES, fixed, restore, state_of
 from sigmasplat.run_folder.state import read_state, write_state
+from sigmasplat.system.array_interface import Correction
 from sigmasplat.system.slam import Slam
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
@@ -82,13 +83,15 @@ def test_a_keyframe_is_mapped_with_the_next_frame_or_at_the_end() -> None:
         assert step.is_keyframe or system.late is None or not system.late.mapped
     assert waited > 3
     number = sum(step.is_keyframe for step in system.steps)
-    cut = slam()
+    cut, found = slam(), list[Correction]()
+    cut.on_correction(found.append)
     for frame in seen():  # ends at a keyframe that waits
         if cut.step(frame).is_keyframe and len(cut.steps) > 10:
             break
     assert cut.late is not None and cut.late.mapped
     cut.finish()
     assert cut.late is None and cut.keyframe_indices[-1] == len(cut.steps) - 1
+    assert found[-1].reason == "final map" and found[-1].frames.max() < len(cut.steps) - 1
     assert len(system.keyframe_indices) + (system.late is not None and system.late.mapped) == number
 
 

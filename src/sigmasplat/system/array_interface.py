@@ -63,7 +63,10 @@ def correction_since(old: Atlas, new: Atlas) -> Correction | None:
     refined = new.refined.keys() != old.refined.keys()
     if not refined and np.array_equal(np.array(old.anchors), np.array(new.anchors)[: len(old.anchors)]):
         return None
-    earlier = new.places.first(len(old.places))
+    count = len(old.places)
+    if count and new.places[count - 1][:2] >= (len(old.keyframe_poses) - 1, len(old.keyframe_poses.last)):
+        count -= 1  # this frame waited for the next one, and has become a keyframe that `old` does not have
+    earlier = new.places.first(count)
     T_before, T_now = (replace(atlas, places=earlier).T_world_camera() for atlas in (old, new))
     frames = np.flatnonzero((T_before != T_now).any((1, 2)))
     if not len(frames):
