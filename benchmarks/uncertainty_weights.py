@@ -109,8 +109,8 @@ def collected(run: FinishedRun, held: Sequence[tuple[int, Keyframe]]) -> Arrays:
     """Return "KIND|QUANTITY|parts" [K, P], "…|squared_error" [P, C] and "…|views" of a run's final map and submaps."""
     view = make_view(run.config.backend, run.camera, run.config.render, variance=False)
     whole = run.part(range(len(run.store)), refined=len(run.refined) == len(run.store))
-    probes = probe_views(run.store, run.anchors, size_of(run))
-    refined_probes = probe_views(whole, run.anchors, size_of(run))
+    probes = list(probe_views(run.store, run.anchors, view))
+    refined_probes = list(probe_views(whole, run.anchors, view))
     owner = [s for s in range(len(run.store)) for _ in run.store.load(s).probe_frames]
     samples = dict[str, list[tuple[Samples, Samples]]]()
     chosen = np.unique(np.linspace(0, len(run.store) - 1, SUBMAPS).round().astype(int)).tolist()

@@ -41,16 +41,18 @@ FIRM = ("extrapolated",)
 """Weights that stay near `pulled_to`: probe views are on the path, so they say little about views away from it."""
 
 
-def probe_views(store: SubmapStore, anchors: Sequence[Matrix], size: tuple[int, int]) -> list[Keyframe]:
-    """Return the probe views of all submaps, with poses in the world; anchors: T_world_submap [4, 4] of each submap,
-    size: (rows, columns) of the planes of a view."""
-    found = list[Keyframe]()
+def probe_views(
+    store: SubmapStore, anchors: Sequence[Matrix], view: View, most: int | None = None
+) -> Iterator[Keyframe]:
+    """Yield probe views of all submaps, evenly spread, with poses in the world, for planes of a view; anchors:
+    T_world_submap [4, 4] of each submap; most: None = all. Their images are read one by one."""
+    found, size = list[tuple[int, int, int, Matrix]](), (view.alpha.shape[0], view.alpha.shape[1])
     for s in range(len(store)):
         submap = store.load(s)
-        for k, (frame, T_submap_probe) in enumerate(zip(submap.probe_frames, submap.T_submap_probe, strict=True)):
-            target = Target.of_picture(store.probe(s, k), submap.camera, size)
-            found.append(Keyframe(frame, target, anchors[s] @ T_submap_probe, fixed=True))
-    return found
+        found += [(s, k, frame, anchors[s] @ submap.T_submap_probe[k]) for k, frame in enumerate(submap.probe_frames)]
+    for s, k, frame, T_world_probe in evenly_spread(found, len(found) if most is None else most):
+        target = Target.of_picture(store.probe(s, k), view.camera, size)
+        yield Keyframe(frame, target, T_world_probe, fixed=True)
 
 
 def final_uncertainty(
@@ -79,11 +81,10 @@ def map_uncertainty(
     keyframes = KeyframeReader(store, anchors, view)
     background = background_of(keyframes)
     splats = splat_residuals(field, _counted(keyframes, progress), config.render, config.backend)
-    probes = probe_views(store, anchors, (view.alpha.shape[0], view.alpha.shape[1]))
-    chosen = evenly_spread(probes, PROBES_MOST)
-    color, depth = probe_samples(field, splats, background, chosen, config)
+    probes = probe_views(store, anchors, view, PROBES_MOST)
+    color, depth = probe_samples(field, splats, background, probes, config)
     calibration = Calibration(color.fitted(pulled_to.color), depth.fitted(pulled_to.depth), pulled_to.temperature)
-    return MapUncertainty(splats, background, calibration, len(chosen))
+    return MapUncertainty(splats, background, calibration, color.views)
 
 
 def _counted(keyframes: KeyframeReader, progress: Progress) -> Iterator[Keyframe]:

@@ -66,10 +66,10 @@ class FinishedMap:
             )
         known = tensors.get("submap_component")
         components = [0] * len(store) if known is None else [int(number) for number in known]
-        submaps = [store.load(index) for index in range(len(store))]
-        poses = [list(np.asarray(submap.T_submap_camera, np.float64)) for submap in submaps]
+        poses = [list(np.asarray(store.load(index).T_submap_camera, np.float64)) for index in range(len(store))]
         frames = len(tensors["timestamps_s"])
-        return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, submaps[0].camera, facts)
+        camera = store.load(0).camera
+        return FinishedMap(run, run.config(), store, list(anchors), components, poses, frames, camera, facts)
 
     @property
     def members(self) -> list[int]:

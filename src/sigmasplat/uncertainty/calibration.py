@@ -32,15 +32,16 @@ FARTHEST_M = 0.3
 
 def background_of(keyframes: Iterable[Keyframe]) -> Background:
     """Return mean and variance of the colours and the variance of the depths of keyframes, over every 7th pixel."""
-    colors, depths = list[Tensor](), list[Tensor]()
+    sums = torch.zeros(3, 4, dtype=torch.float64)  # number, sum and sum of squares of red, green, blue and depth
     for keyframe in keyframes:
-        colors.append(keyframe.target.image.reshape(-1, 3)[::7].double())
-        depth = keyframe.target.depth_image.reshape(-1)[::7].double()
-        depths.append(depth[depth > 0])
-    color, depth = torch.cat(colors), torch.cat(depths)
-    red, green, blue = color.mean(0).tolist()
-    depth_variance = float(depth.var(correction=0)) if len(depth) else 1.0
-    return Background((red, green, blue), float(color.var(0, correction=0).mean()), depth_variance)
+        color, depth = keyframe.target.image.reshape(-1, 3), keyframe.target.depth_image.reshape(-1, 1)
+        values = torch.cat([color, depth], 1)[::7].double()
+        known = torch.cat([torch.ones_like(values[:, :3]), values[:, 3:] > 0], 1)
+        sums += torch.stack([known.sum(0), values.sum(0), values.square().sum(0)])
+    mean, square = sums[1:] / sums[0].clamp(min=1.0)
+    variance, (red, green, blue, _) = (square - mean.square()).clamp(min=0.0), mean.tolist()
+    depth_variance = float(variance[3]) if sums[0, 3] else 1.0
+    return Background((red, green, blue), float(variance[:3].mean()), depth_variance)
 
 
 def splat_residuals(field: GaussianField, keyframes: Iterable[Keyframe], options: RenderConfig, backend: str) -> Tensor:

@@ -63,7 +63,7 @@ class Background:
 
 @dataclass(frozen=True, eq=False)
 class SplatStd:
-    """Standard deviation of what each splat shows (`uncertainty.splat_std`): depth_std_m [N] of its surface, m;
+    """Standard deviation of what each splat shows (`calibration.splat_std`): depth_std_m [N] of its surface, m;
     color_std [N], the root of the variance averaged over red, green and blue, for colours in [0, 1]."""
 
     depth_std_m: Tensor
