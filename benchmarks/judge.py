@@ -98,7 +98,7 @@ class Pairs:
         frame = Frame(0, 0.0, color.astype(np.float32) / 255.0, depth, self.images.camera)
         working = working_frame(frame, CONFIG)
         self.view = self.view or view_of(working.camera, CONFIG)
-        return observe(frame, working, self.view, CONFIG, None).live
+        return observe(frame, working, self.view, None).live
 
     def drawn(self) -> tuple[Pyramid, Pyramid, NDArray[np.float64]] | None:
         """Return two images and their true motion T_b_a [4, 4]; None if the second frame is outside the recording."""

@@ -82,4 +82,4 @@ def test_a_furnished_room_looks_like_no_other_place() -> None:
     room = SyntheticRoom(frames=60, width=160, height=120)
     for i in (0, 20, 40):
         frame = working_frame(room.frame(i), CONFIG)
-        assert places_alike(observe(room.frame(i), frame, view_of(frame.camera, CONFIG), CONFIG, None).live) == 1
+        assert places_alike(observe(room.frame(i), frame, view_of(frame.camera, CONFIG), None).live) == 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from constants import changed
 from sigmasplat.config import Config
@@ -161,6 +162,18 @@ def test_a_run_resumes_with_the_same_bytes_after_a_relocalisation(kidnapped: Rec
     assert contents(slam) == contents(whole)
     assert dataclasses.asdict(slam.tracker.statistics) == dataclasses.asdict(whole.tracker.statistics)
     assert slam.relocaliser.indexed == whole.relocaliser.indexed
+
+
+def test_a_hop_after_a_relocalisation_has_the_error_of_the_hops_since_the_place() -> None:
+    """The first keyframe after it is aligned to the one where the camera was found, not to the newest one."""
+    order = [*range(0, 60, 2), BLACK, BLACK, *range(4, 14, 2)]
+    slam = followed(order, settings(submaps__frames="0", submaps__distance_m="0", submaps__uncertainty_m="0"))
+    numbers, T = slam.keyframe_indices, walk().truth().T_world_camera
+    row = next(row for row, number in enumerate(numbers) if number > states(slam).index("relocalised"))
+    hop, (before, now) = slam.atlas.hops[row], (T[order[numbers[k]]] for k in (row - 1, row))
+    off = se3.log(se3.inverse(now) @ before @ se3.inverse(hop.T_a_b))
+    assert hop.total_covariance is not None
+    assert off @ np.linalg.solve(hop.total_covariance, off) < chdtri(6, 1e-3)
 
 
 @pytest.mark.slow

@@ -26,10 +26,12 @@ USUAL_M = 2.0
 
 @dataclass(eq=False)
 class Reference:
-    """An image with depth and pixel weights that other images are aligned to, and its pose T_camera_world [4, 4]."""
+    """An image with depth and pixel weights that other images are aligned to, and its pose T_camera_world [4, 4].
+    keyframe: its number in the active submap, if the camera was found there; −1: the newest one."""
 
     pyramid: Pyramid
     T_camera_world: Matrix
+    keyframe: int = -1
 
     @property
     def depth_m(self) -> Image:

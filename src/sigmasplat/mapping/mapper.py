@@ -103,7 +103,7 @@ class Mapper:
         frozen_below = self._frozen_below(first_new, "half")
         fit = yield from self._fit(view, window, steps // 2, rates, frozen_below, stats, should_stop)
         self._densify(view, stats)
-        self._prune(view)
+        self._prune()
         yield
         self.half = SecondHalf(
             steps - steps // 2, self._frozen_below(first_new, "end"), self._fade_uncertain(view, window)
@@ -123,7 +123,7 @@ class Mapper:
         fit = yield from self._fit(view, window, steps, rates, half.frozen_below, None, should_stop, share)
         half.steps -= len(fit.losses)
         if at_most is None or not half.steps:
-            self._prune(view, self._still_uncertain(view, window, half.faded))
+            self._prune(self._still_uncertain(view, window, half.faded))
             self.half = None
         return fit
 
@@ -285,7 +285,7 @@ class Mapper:
         keyframes = window if self.config.mapping.window else window[:1]
         return densify.splat_uncertainty(self.field, view, keyframes)[0]
 
-    def _prune(self, view: View, also: Tensor | None = None) -> None:
+    def _prune(self, also: Tensor | None = None) -> None:
         """Remove splats that are too faint or too large, and those marked in `also` [N]."""
         gone = self.field.opacities <= self.config.mapping.prune_opacity
         gone |= densify.too_large(self.field, self.config.primitives.most_scale_m)

@@ -138,7 +138,7 @@ class BackEnd:
             state, T, hop = ("" if place is None else RELOCALISED), np.eye(4), UNKNOWN_HOP
         else:
             state, (T, alignment) = "", self._realigned(each, offer)
-            hop = system.hop_to(se3.inverse(T), alignment, offer.wrong)
+            hop = system.hop_to(se3.inverse(T), alignment, offer.wrong, offer.reference)
             if system.cuts:
                 system.add_drift(T, alignment)
         may_wait = not first and self._added < MOST_ADDED and not system.submap_ends(number, T)

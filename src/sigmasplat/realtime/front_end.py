@@ -139,7 +139,8 @@ class FrontEnd:
         if snapshot.newest >= self.newest or snapshot.state:
             self.tracker.follow(snapshot.keyframe)
             self.newest = snapshot.newest
-        self.waits = tuple(number for number in self.waits if number > snapshot.newest)
+        # keyframes that were tracked before the camera was found are not mapped
+        self.waits = () if snapshot.state else tuple(number for number in self.waits if number > snapshot.newest)
         if snapshot.searched >= self.searching:
             self.searching = -1
         self.snapshot = snapshot
@@ -206,7 +207,7 @@ class FrontEnd:
         else:
             self.tracker.came_from(found.T_world_camera)
         T = frame.T_submap_camera @ se3.inverse(late.T_world_camera) @ found.T_world_camera
-        offer = _offered(replace(found, seen=found.seen.at_once(view, self.config))) if found.mapped else None
+        offer = _offered(replace(found, seen=found.seen.at_once(view))) if found.mapped else None
         return [replace(frame, T_submap_camera=T, offer=offer)]
 
     def _begin(self, seen: PreparedFrame) -> FrameEstimate:
@@ -260,7 +261,7 @@ class FrontEnd:
         views = ValidationViews(self.config.uncertainty.probes, self.config.mapping.every)
         wanted = not is_held_back(number, self.config.input.hold_every)
         kept = wanted and views.wants(self.offered - 1, number - self.newest)
-        return seen.at_once(view, self.config, photo=False).target if kept else None
+        return seen.at_once(view, photo=False).target if kept else None
 
     def _step(self, seen: PreparedFrame, estimate: FrameEstimate, timer: StepTimer, view: View) -> Step:
         if estimate.state == TRACKED and self.found:

@@ -75,7 +75,7 @@ class Localiser:
         """Return where an image was taken."""
         frame = self.filtered(frame)
         working = working_frame(frame, self.config, self.finished.camera)
-        seen = observe(frame, working, self.view, self.config, self.extractor)
+        seen = observe(frame, working, self.view, self.extractor)
         if not usable(seen):
             return Localisation(frame.index, frame.timestamp_s, NOT_FOUND, "too little depth or texture")
         result = self.relocaliser.search(self.known, self.view, seen, index_at_most=None)

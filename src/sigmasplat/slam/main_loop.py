@@ -77,7 +77,7 @@ class MainLoop(MappingBackend):
 
     def _read_first_at_once(self, first: NewestFrame) -> None:
         """Rewrite the first frame, which was mapped before it was known how its camera moved."""
-        seen, keyframe = first.seen.at_once(self.view, self.config), self.mapper.keyframes[-1]
+        seen, keyframe = first.seen.at_once(self.view), self.mapper.keyframes[-1]
         keyframe.target, keyframe.photo = seen.target, seen.photo(self.config)
         self.images.kept.clear()
         self.tracker.keep_keyframe(self.mapper.field.params, self.view, seen, first.T_world_camera, first.front)
@@ -86,11 +86,12 @@ class MainLoop(MappingBackend):
         """Map a keyframe, as if it was read at once and without what moves in front, in the exposure of the map; cut
         the submap if a rule ends it here; look for the place in other components. Return its pose."""
         view, tracker, number = self.view, self.tracker, found.number
-        seen, T = found.seen.at_once(view, self.config), found.T_world_camera
+        seen, T = found.seen.at_once(view), found.T_world_camera
         seen = fitted_keyframe(tracker, self.mapper.field.params, view, seen, T, found.connected).without(found.front)
         if self.config.tracking.exposure and self.config.mapping.colors == "code":
             seen = seen.without_exposure(found.exposure)
-        hop = self.hop_to(se3.inverse(T), found.alignment, found.wrong) if found.connected else UNKNOWN_HOP
+        errors = found.alignment, found.wrong, found.reference
+        hop = self.hop_to(se3.inverse(T), *errors) if found.connected else UNKNOWN_HOP
         T = self._mapped(seen, found, T, hop)
         if self.submap_ends(number, T):
             completed(self.cut(T))
@@ -141,7 +142,7 @@ class MainLoop(MappingBackend):
         elif held_back:
             return estimate  # a search for the camera could make a keyframe of this frame
         elif (place := self.relocalise(seen)) is not None:
-            self._go_to(place, seen, estimate)
+            self._go_to(place, estimate)
         elif self.recovery.gives_up and usable(seen):
             self._begin_apart(estimate)
         return estimate
@@ -156,12 +157,12 @@ class MainLoop(MappingBackend):
             index, newest, last = len(self.steps), self.mapper.keyframes[-1], len(self.mapper.keyframes) - 1
             if self.validation_views.wants(last, index - newest.index):
                 T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
-                shown = seen.at_once(self.view, self.config, photo=False).target
+                shown = seen.at_once(self.view, photo=False).target
                 self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, shown)
 
     # ---- lost and found ----
 
-    def _go_to(self, place: Relocation, seen: PreparedFrame, estimate: FrameEstimate) -> None:
+    def _go_to(self, place: Relocation, estimate: FrameEstimate) -> None:
         """Continue where the camera was found: in the active submap, or in a new one that is connected to the place."""
         estimate.state, submap = RELOCALISED, place.where[0]
         estimate.comparison, estimate.inliers = place.comparison, place.inliers

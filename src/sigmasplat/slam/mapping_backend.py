@@ -14,6 +14,7 @@ from sigmasplat.data.readout import AT_ONCE, Readout
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
+from sigmasplat.fit.references import Reference
 from sigmasplat.fit.target import Keyframe
 from sigmasplat.graph.closer import PendingSearch
 from sigmasplat.graph.confidence import places_alike
@@ -21,7 +22,7 @@ from sigmasplat.graph.graph_errors import calibration_std, moved_by_camera
 from sigmasplat.graph.keyframe_graph import WINDOW
 from sigmasplat.mapping.mapper import Mapper
 from sigmasplat.slam.slam_state import SlamState
-from sigmasplat.tracking.drift import Drift
+from sigmasplat.tracking.drift import UNKNOWN, Drift
 from sigmasplat.tracking.keyframe_rule import ends_submap
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.recovery import usable
@@ -162,13 +163,21 @@ class MappingBackend(SlamState):
         self.confidence.placed(number, hop.wrong, aligned, alike)
         return self.atlas.keyframe_poses.last[-1]
 
-    def hop_to(self, T_camera_submap: Matrix, alignment: Alignment | None, wrong: float) -> RelativePose:
-        """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to it;
-        wrong: the probability that the motion is wrong."""
-        T_camera_before = T_camera_submap @ self.atlas.keyframe_poses.last[-1]
+    def hop_to(
+        self, T_camera_submap: Matrix, alignment: Alignment | None, wrong: float, reference: Reference | None = None
+    ) -> RelativePose:
+        """Return the motion from the newest keyframe to a new one, with its errors; alignment: of the new one to
+        `reference`, which is an earlier keyframe if the camera was found there: then the motion contains the hops from
+        it to the newest one; wrong: the probability that the motion is wrong."""
+        poses, hops = self.atlas.keyframe_poses.last, self.atlas.hops
+        T_camera_before = T_camera_submap @ poses[-1]
         if alignment is None:
             return RelativePose.hop(T_camera_before, wrong=wrong)
-        errors, camera = [alignment.covariance, alignment.bias], calibration_std(self.config.input, self.view.camera)
+        covariance, since = alignment.covariance, [] if reference is None else poses[reference.keyframe :][1:]
+        for T_submap_keyframe, hop in zip(since, hops[len(hops) - len(since) :], strict=True):
+            A, known = se3.adjoint(T_camera_submap @ T_submap_keyframe), hop.total_covariance
+            covariance = covariance + A @ (UNKNOWN if known is None else known) @ A.T
+        errors, camera = [covariance, alignment.bias], calibration_std(self.config.input, self.view.camera)
         if camera is not None:
             errors.append(camera * moved_by_camera(T_camera_before, alignment.pair.reference.points))
         return RelativePose.hop(T_camera_before, *errors, wrong=wrong)

@@ -146,7 +146,7 @@ class SlamState:
         working = working_frame(frame, self.config, view.camera if self._resample else None)
         if working.camera != view.camera:
             raise SourceError(f"frame {frame.index} comes from another camera ({working.camera}) than the first")
-        return observe(frame, working, view, self.config, extractor)
+        return observe(frame, working, view, extractor)
 
     def start_timer(self) -> StepTimer:
         """Measure the stages from now on; return the timer."""

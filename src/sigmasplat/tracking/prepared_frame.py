@@ -55,7 +55,7 @@ class PreparedFrame:
         self.reading = Readout(rate, self.frame.depth_late_s)
         self.live = self.live.read(times.read(self.reading))
 
-    def at_once(self, view: View, config: Config, photo: bool = True) -> "PreparedFrame":
+    def at_once(self, view: View, photo: bool = True) -> "PreparedFrame":
         """Return the frame as if all rows had been read at once, as far as it is known when they were; photo: also the
         whole image."""
         readout = self.live.readout
@@ -63,7 +63,7 @@ class PreparedFrame:
             return self
         whole = read_at_once(self.whole, readout) if photo else self.whole
         frame = self.frame.with_depth(self.target.depth_image.numpy())  # predicted depth is fitted in the target alone
-        found = observe(whole, read_at_once(frame, readout), view, config, None)
+        found = observe(whole, read_at_once(frame, readout), view, None)
         return replace(found, image=self.image, live=found.live.noisier(self.live.noise_per_m / found.live.noise_per_m))
 
     @property
@@ -144,7 +144,7 @@ def working_frame(frame: Frame, config: Config, camera: Camera | None = None) ->
     return working.with_depth(depth_m)
 
 
-def observe(whole: Frame, working: Frame, view: View, config: Config, extractor: Extractor | None) -> PreparedFrame:
+def observe(whole: Frame, working: Frame, view: View, extractor: Extractor | None) -> PreparedFrame:
     """Return a frame in the forms that tracking needs: features are found in the whole frame, everything else is made
     from the working frame."""
     ignored = whole.ignored_by(working.camera)
@@ -180,7 +180,8 @@ class TrackedKeyframe:
     def weighed(self, params: Tensor, view: View, config: TrackingConfig) -> "TrackedKeyframe":
         """Return a keyframe of the map at which the camera was found, weighed by the map with rows `params` [N, 17]."""
         own = self.reference
-        return replace(self, reference=keyframe_reference(params, view, own.pyramid, own.T_camera_world, config))
+        weighed = keyframe_reference(params, view, own.pyramid, own.T_camera_world, config)
+        return replace(self, reference=replace(weighed, keyframe=own.keyframe))
 
 
 def mapped_keyframe(

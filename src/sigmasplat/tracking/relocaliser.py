@@ -214,7 +214,7 @@ class Relocaliser:
             return
         T_keyframe_submap, c = se3.inverse(known.T_submap_camera(where)), self.config.tracking
         guess = found.T_live_reference @ T_keyframe_submap
-        own = Reference(picture_images(view, picture, view.camera)[1], T_keyframe_submap)
+        own = Reference(picture_images(view, picture, view.camera)[1], T_keyframe_submap, where[1])
         keyframe = TrackedKeyframe(own, FeatureImage.of_picture(picture, view.camera))
         params = known.splats(where[0]).params.to(view.sums.device)
         for reference in (own, None):
