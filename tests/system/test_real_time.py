@@ -15,9 +15,10 @@ import pytest
 from command_line import exit_code
 from constants import changed
 from schedules import AtOnce, Drawn, Late
-from sigmasplat.config import Config
+from sigmasplat.config import Config, RealTimeConfig
 from sigmasplat.config.find_preset import preset
 from sigmasplat.config.text import override
+from sigmasplat.data import se3
 from sigmasplat.data.frame import Frame
 from sigmasplat.data.submap import MemoryStore
 from sigmasplat.data.trajectory import LOST, RELOCALISED
@@ -27,7 +28,7 @@ from sigmasplat.realtime.system import MappingThread, RealTime
 from sigmasplat.run.resume import restore, state_of
 from sigmasplat.run_folder.runs import RunFolder
 from sigmasplat.system.slam import Slam
-from small_room import SMALL, frames, walk
+from small_room import SMALL, frame_at, frames, walk
 
 pytest.importorskip("sigmasplat.native._core", reason="the kernels are not built (make test builds them)")
 
@@ -115,6 +116,22 @@ def test_a_lost_camera_is_reported_at_once_and_found_again(seed: int) -> None:
     poses = system.trajectory().T_world_camera
     assert np.abs(poses[-1, :3, 3] - poses[4, :3, 3]).max() < 0.03
     assert np.isfinite(poses).all()
+
+
+def test_a_search_does_not_move_a_camera_that_is_tracked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One frame shows another place. While the map is searched for it, the camera goes on, and makes keyframes."""
+    monkeypatch.setattr(RealTimeConfig, "waiting_most", 2)
+    path, schedule = [*range(0, 40, 2), 2, *range(40, 80, 2)], Late(10**6)
+    system, states = RealTime(Slam(config(keyframe_deg=0.0)), schedule), list[str]()
+    for number, i in enumerate(path):
+        schedule.slices = {20: 1}.get(number, 0 if 20 < number < 30 else 10**6)
+        states.append(system.step(replace(frame_at(i), index=number, timestamp_s=number / 30)).state)
+    system.settle()
+    assert states[20] == LOST and states[22:] == ["tracked"] * 19
+    T = walk().truth().T_world_camera[path]
+    off_m = np.linalg.norm((system.trajectory().T_world_camera - se3.inverse(T[0]) @ T)[:, :3, 3], axis=1)
+    assert off_m[system.valid()].max() < 0.03
+    assert system.slam.keyframe_indices[-1] > 35
 
 
 def test_a_keyframe_is_a_matter_of_motion() -> None:

@@ -188,17 +188,20 @@ class BackEnd:
 
     # ---- lost and found ----
 
+    def _tracked_again(self) -> bool:
+        """Return whether a frame that waits was tracked: its pose, unlike that of a lost frame, needs no search."""
+        self._take()
+        return any(isinstance(each, TrackedFrame) and not each.step.lost for each in self._pending)
+
     def _search(self, each: TrackedFrame, seen: PreparedFrame) -> Iterator[None]:
-        """Search the whole map for a frame, and tell tracking the result."""
+        """Search the whole map for a frame, and tell tracking the result, unless the camera is tracked again."""
         system, number = self.system, each.number
         self._timer = system.start_timer()
-        waiting = (each for each in self._pending if isinstance(each, TrackedFrame))
-        recovered = self._take() and any(not each.step.lost for each in waiting)  # the camera was tracked again
-        place = None if recovered else (yield from system.relocalising(seen))
+        place = None if self._tracked_again() else (yield from system.relocalising(seen))
         yield
-        if place is not None:
+        if place is not None and not self._tracked_again():
             yield from self._go_to(place, number, seen)
-        elif each.apart and not recovered:
+        elif each.apart and not self._tracked_again():
             yield from system.begin_apart()
             yield from self._map_found(number, seen, APART)
         elif self.last is not None:
