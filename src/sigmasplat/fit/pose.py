@@ -16,7 +16,7 @@ from sigmasplat.fit.backends import fits_of
 from sigmasplat.fit.compare import Comparison, best_alignment, compare
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
-from sigmasplat.fit.target import Target
+from sigmasplat.fit.target import NEARLY_BLACK, Target
 from sigmasplat.fit.tracking_loss import PoseMaps, agreement
 from sigmasplat.render.view import View
 from sigmasplat.types import Matrix
@@ -93,8 +93,8 @@ def fit_pose_align(
 
 EVERY = 47
 """Every 47th pixel is used: 1600 pixels of a 320×240 image determine two numbers per channel well."""
-OPAQUE, DARKEST, BRIGHTEST = 0.9, 0.01, 0.98
-"""Pixels are used if the map covers them, and no channel of the recorded colour is black or saturated."""
+OPAQUE, BRIGHTEST = 0.9, 0.98
+"""Pixels are used if the map covers them, and no channel of the recorded colour is nearly black or saturated."""
 OUTLIER = 0.03
 """Residuals above this count less: weight 1 / (|r| + OUTLIER), the L1 norm for large ones."""
 PRIOR = np.diag([0.002, 0.01])
@@ -105,7 +105,7 @@ def fit_exposure(view: View, target: Target) -> Matrix:
     """Return the exposure [3, 2] with which a view's rendered colours are nearest to those of an image, by one step of
     iteratively reweighted least squares; neutral if no pixel can be compared."""
     rendered, recorded = (_sampled(plane) for plane in (view.sums[:3], target.color))
-    known = (_sampled(view.alpha[None])[0] > OPAQUE) & (recorded.min(0) > DARKEST) & (recorded.max(0) < BRIGHTEST)
+    known = (_sampled(view.alpha[None])[0] > OPAQUE) & (recorded.min(0) > NEARLY_BLACK) & (recorded.max(0) < BRIGHTEST)
     if not known.any():
         return NEUTRAL.copy()
     r, c = rendered[:, known], recorded[:, known]

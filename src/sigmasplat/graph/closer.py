@@ -24,7 +24,7 @@ from sigmasplat.graph.candidates import (
     pairs_to_register,
 )
 from sigmasplat.graph.loops import Loop, Loops, described
-from sigmasplat.graph.pose_graph import PoseGraph, PoseGraphSolution, most_chi2, optimise
+from sigmasplat.graph.pose_graph import LARGE, PoseGraph, PoseGraphSolution, most_chi2, optimise
 from sigmasplat.graph.registration import Registrar
 from sigmasplat.render.view import View
 from sigmasplat.tracking.descriptors import Descriptor, OrientationGrid
@@ -69,8 +69,8 @@ def _lacks_weights(config: LoopConfig) -> bool:
     return config.descriptor == "netvlad-or-grid" and not config.weights
 
 
-MOST_FREE = 100
-"""A larger graph is solved in parts of this many nodes; a smaller one is always solved as a whole."""
+MOST_FREE = LARGE
+"""A larger graph is solved in parts of this many nodes, each directly; a smaller one is always solved as a whole."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +135,10 @@ class PendingSearch:
 class LoopCloser:
     """Keeps the descriptors of finished submaps and all edges between them. During a run only this class moves anchors.
 
-    edges: trusted ones, such as odometry, and registered loops, each with its row in `loops`, -1 for a trusted one.
+    edges: trusted ones, such as odometry, and registered loops, each with its row in `loops` (`Edges.loop_row`).
     solved: the number of submaps when the whole pose graph was last solved. In between, and in a graph
     that is larger than the largest part, loops move only the submaps near them in the graph (`Neighbourhood`).
-    owed: the searches that are not complete, the oldest first.
+    pending: the searches that are not complete, the oldest first.
     """
 
     config: Config

@@ -20,7 +20,7 @@ from sigmasplat.fit.compare import best_alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import picture_images
 from sigmasplat.graph.pose_graph import ROUGHLY, PoseGraph, factorised, minimise, most_chi2
-from sigmasplat.graph.sensor_fit import FIRST_MEASURED, MOST_MEASURED, Pair, measured
+from sigmasplat.graph.sensor_fit import MEASURED, NEIGHBOURS, Pair, measured
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN
 from sigmasplat.tracking.pose_validation import confirmed
@@ -28,7 +28,7 @@ from sigmasplat.types import Matrix, ShouldStop, Task, never
 
 NEAR = 0.5
 """Views are near if between them the image moves by at most this share of its width: then half of it is in both."""
-APART = 4
+APART = NEIGHBOURS + 1
 """Other keyframes that a keyframe is aligned to are this many keyframes apart: neighbours share most errors."""
 NEAREST = 3
 """The nearest views are taken whatever their distance in time; one of them is the keyframe before."""
@@ -194,13 +194,13 @@ class GrowingGraph:
     def is_due(self) -> bool:
         """Return whether the times of the sensor are to be measured: again each time that there are twice as many
         alignments, until the images show them."""
-        enough = len(self.edges) >= max(FIRST_MEASURED, 2 * self.measured)
+        enough = len(self.edges) >= max(MEASURED, 2 * self.measured)
         return self.calibrates and self.times.std_s is None and enough
 
     def measuring(self, image: Callable[[int], Pyramid], reading: Callable[[int], Readout]) -> Task[None]:
         """Measure when the sensor reads, in slices of one pair, and then align all again; image, reading: of a row."""
         self.measured = len(self.edges)
-        self.times = yield from measured(self.pairs(image, reading, MOST_MEASURED))
+        self.times = yield from measured(self.pairs(image, reading, MEASURED))
         if self.times.std_s is None:
             return
         again = Alignments()

@@ -31,8 +31,8 @@ BIAS = 0.1
 """Systematic error of a parameter, in units. Slopes and bends of costs are differences over a whole unit, where a cost
 is not quite a parabola: late depth is found 1 to 2 ms too near to 0. Differences over less than half a unit are several
 times as noisy."""
-LEAST_PAIRS, LEAST_GROUPS = 10, 5
-LEAST_OVERLAP = 0.25
+LEAST_PAIRS, LEAST_GROUPS, LEAST_OVERLAP = 10, 5, 0.25
+"""A fit needs so many pairs, and a test so many groups of them; images of a pair share so much."""
 LEVEL, HOPELESS = 0.999, 0.9
 """Values are used if the hypothesis that all are 0 is rejected at the first level; if the first step is not even sure
 at the second one, it was the last."""
@@ -165,8 +165,8 @@ def newton_step(terms: Sequence[Term]) -> tuple[Matrix, Matrix]:
 
 # ---- the times of the sensor ----
 
-FIRST_MEASURED, MOST_MEASURED = 60, 60
-"""Alignments before the first measurement, and pairs of one."""
+MEASURED = 60
+"""The most pairs of a measurement; the first is made when there are so many alignments."""
 
 
 def read(pair: Pair, times: SensorTimes) -> tuple[Pyramid, Pyramid]:

@@ -47,7 +47,7 @@ class SecondHalf:
 class Mapper:
     """Owns the field and the keyframes of the active submap. Poses are in the submap's frame.
 
-    first_owed: the steps of the first keyframe that are still to be made (`mapping.divided`).
+    first_pending: the steps of the first keyframe that are still to be made (`mapping.divided`).
     half: what is still to be made of the newest keyframe's second half (`mapping.divided`).
     """
 

@@ -128,7 +128,7 @@ class MainLoop(MappingBackend):
             fit = self.tracker.track(self.mapper.field.params, self.view, seen)
         if self.late is not None:
             fit.T_camera_world = fit.T_camera_world @ se3.inverse(self.settle_late(self.tracker.motion))
-        lost, held_back = self.tracker.lost, self._is_held_back
+        lost, held_back = self.tracker.lost, is_held_back(len(self.steps), self.config.input.hold_every)
         self.recovery.count(lost, self.tracker.doubtful > 0, seen)
         estimate = FrameEstimate.of(fit, lost)
         if not lost:
@@ -147,18 +147,15 @@ class MainLoop(MappingBackend):
             self._begin_apart(estimate)
         return estimate
 
-    @property
-    def _is_held_back(self) -> bool:
-        return is_held_back(len(self.steps), self.config.input.hold_every)
-
     def _offer_validation_view(self, seen: PreparedFrame, estimate: FrameEstimate) -> None:
         """Offer a frame as a validation view if it was tracked without doubt and is not held back."""
-        if may_validate(estimate, self.tracker, self.recovery) and not self._is_held_back:
-            index, newest, last = len(self.steps), self.mapper.keyframes[-1], len(self.mapper.keyframes) - 1
-            if self.validation_views.wants(last, index - newest.index):
-                T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
-                shown = seen.at_once(self.view, photo=False).target
-                self.validation_views.offer(index, last, index - newest.index, T_keyframe_camera, shown)
+        index, newest, last = len(self.steps), self.mapper.keyframes[-1], len(self.mapper.keyframes) - 1
+        since, held_back = index - newest.index, is_held_back(index, self.config.input.hold_every)
+        wanted = not held_back and self.validation_views.wants(last, since)
+        if wanted and may_validate(estimate, self.tracker, self.recovery):
+            T_keyframe_camera = se3.inverse(newest.T_world_camera) @ estimate.T_submap_camera
+            shown = seen.at_once(self.view, photo=False).target
+            self.validation_views.offer(index, last, since, T_keyframe_camera, shown)
 
     # ---- lost and found ----
 
@@ -178,6 +175,5 @@ class MainLoop(MappingBackend):
     def _begin_apart(self, estimate: FrameEstimate) -> None:
         """Begin a new map at the camera, whose place in the world is not known yet."""
         completed(self.begin_apart())
-        self.tracker.forget()
         self.recovery.found()
         estimate.T_submap_camera, estimate.state, estimate.mapped = np.eye(4), APART, True

@@ -12,6 +12,7 @@ from sigmasplat.data import se3
 from sigmasplat.data.field import GaussianField
 from sigmasplat.data.readout import AT_ONCE, Readout
 from sigmasplat.data.relative_pose import UNKNOWN_HOP, RelativePose
+from sigmasplat.data.trajectory import evenly_spread
 from sigmasplat.fit.align import Alignment
 from sigmasplat.fit.pyramid import Pyramid
 from sigmasplat.fit.references import Reference
@@ -327,7 +328,7 @@ class MappingBackend(SlamState):
     def _connect_components(self) -> None:
         """When all is mapped, search other components for the keyframes of those that are apart."""
         for s, poses in enumerate(self.atlas.keyframe_poses):
-            for k in sorted({round(i) for i in np.linspace(0, len(poses) - 1, LAST_TRIES)}):
+            for k in evenly_spread(range(len(poses)), LAST_TRIES):
                 if self.atlas.components[s]:
                     known = self._known([True] * len(self.atlas.components))
                     seen = PreparedFrame.of_picture(known.picture((s, k)), self.view)

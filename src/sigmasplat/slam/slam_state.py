@@ -1,4 +1,4 @@
-"""The state of SLAM, and how to read it: map, path, components, checkpoint."""
+"""The state of SLAM, and how to read it: map, path, submaps, loops."""
 
 import numpy as np
 import torch

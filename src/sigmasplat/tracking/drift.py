@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sigmasplat.data import se3
+from sigmasplat.fit.align import UNKNOWN_M
 from sigmasplat.types import Matrix
 
 HOP_M, HOP_RAD = 0.002, 0.002
@@ -13,7 +14,7 @@ HOP_M, HOP_RAD = 0.002, 0.002
 FLOOR_M, FLOOR_RAD = 0.005, 0.003
 """Least standard deviation of a pose between two maps, or in another map: two maps of the same wall differ by about
 this much."""
-UNKNOWN = np.diag([1.0] * 6)
+UNKNOWN = UNKNOWN_M**2 * np.eye(6)
 """Covariance of a hop between images without overlap, or of another pose without an estimate, m² and rad²."""
 BIAS = 0.02
 """Relative systematic error of the distance travelled and the angle turned: calibration errors do not average out over

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sigmasplat.config import Config
 from sigmasplat.data.camera import Camera
+from sigmasplat.data.readout import SAME_SURFACE
 from sigmasplat.env import opencv
 from sigmasplat.types import Matrix
 
@@ -108,10 +109,6 @@ def matched_by_distance(a: NDArray[np.float32], b: NDArray[np.float32], ratio: f
     return np.asarray(np.stack([rows, best], 1)[good])
 
 
-STEP_SHARE = 0.03
-"""A reading is at a depth step if the 3×3 readings around it differ by more than this share of the depth."""
-
-
 @dataclass(frozen=True, eq=False)
 class Landmarks:
     """Features with a position in space, points_m [N, 3], in the frame of the camera that saw them."""
@@ -139,13 +136,14 @@ def landmarks_of(features: Features, depth_m: NDArray[np.float32], depth_camera:
 
 
 def depth_readings(features: Features, depth_m: NDArray[np.float32], depth_camera: Camera) -> Matrix:
-    """Return the depth of each feature [N], m: the reading of the nearest pixel; 0 = no reading, or a depth step."""
+    """Return the depth of each feature [N], m: the reading of the nearest pixel; 0 = no reading, or a depth step, where
+    the 3×3 readings are not of one surface."""
     column, row, inside = nearest_pixels(features, depth_camera)
     padded = np.pad(np.asarray(depth_m, np.float64), 1)
     around = np.stack([padded[row + i, column + k] for i in range(3) for k in range(3)])
     z = around[4]
     low = np.where(around > 0, around, np.inf).min(0)
-    smooth = around.max(0) - low <= STEP_SHARE * z
+    smooth = around.max(0) - low <= SAME_SURFACE * z
     return np.where(inside & (z > 0) & smooth, z, 0.0)
 
 
@@ -161,13 +159,15 @@ def nearest_pixels(features: Features, camera: Camera) -> tuple[NDArray[np.intp]
 
 
 LEAST_INLIERS = 8
+"""A pose needs so many matches: chance alone lets a few agree with the three that it was computed from."""
 RANSAC_PX = 3.0
-"""A match supports a pose if its reprojection error is below this, in pixels of an image 640 pixels wide; it scales
+"""A match supports a pose if its reprojection error is below this, in pixels of an image of `FEATURE_WIDTH`; it scales
 with the width."""
 RANSAC_TRIES = 1000
 """Maximum number of minimal samples per pose. Fewer are drawn if a pose is found with `CONFIDENCE` sooner."""
 CONFIDENCE = 0.999
 NEAREST_M = 0.05
+"""Points that are nearer are behind the camera, as far as it can tell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +191,7 @@ def pose_from_landmarks(landmarks: Landmarks, features: Features, pairs: Pairs, 
     if len(pairs) < LEAST_INLIERS:
         return None
     points_m, seen = landmarks.points_m[pairs[:, 0]], features.points[pairs[:, 1]].astype(np.float64)
-    gate_px = RANSAC_PX * features.camera.width / 640.0
+    gate_px = RANSAC_PX * features.camera.width / FEATURE_WIDTH
     T = _ransac(points_m, seen, features.camera, seed, gate_px)
     if T is None:
         return None

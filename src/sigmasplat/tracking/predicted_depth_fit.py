@@ -26,20 +26,20 @@ KEPT = 0.95
 """Share of the information that is kept at each keyframe: θ may change slowly."""
 VIEWS = 5
 """A keyframe is compared with this many earlier ones."""
-LEAST_MATCHES = 20
+FEWEST, STEPS = 20, 8
+"""Fewest matches of two views, or cells of a frame, that are fitted to; steps of Gauss–Newton."""
 PIXEL_PX, DEPTH_SHARE = 0.5, 0.05
 """Standard deviations of a match: of the image position, and of the depth at one pixel, as a share of it."""
-STEPS = 8
 CAUCHY = 2.4
-MEDIAN_OF_SQUARE = 1.39
-"""Median of χ² for 2 degrees of freedom."""
-LEAST_SCALE = 0.3
+"""Width of the Cauchy loss, standard deviations: it loses 5 % of the information of Gaussian errors."""
+MEDIAN_OF_SQUARE, LEAST_SCALE = 1.39, 0.3
+"""Median of χ² for 2 degrees of freedom; least factor on the stated variances, whatever few matches show."""
 CORRELATED = 4.0
 """Pairs of views share features, so that each counts as this fraction of independent ones."""
-MOST = 1.0
+MOST, FACTOR_RANGE = 1.0, (0.3, 3.0)
+"""A larger θ shows that matches contradict each other; f stays in this range, also where nothing was matched."""
 NEAREST = 0.1
 """Points nearer than this, as a share of the median depth, are not used."""
-FACTOR_RANGE = (0.3, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class DepthShape:
         for seen, T in views:
             old, old_z = seen.features(extractor), depth_at(seen, extractor)
             pairs = extractor.match(old, new)
-            if len(pairs) < LEAST_MATCHES:
+            if len(pairs) < FEWEST:
                 continue
             a, b = pairs.T
             found = found._measured(old.take(a), old_z[a], new.take(b), T)
@@ -84,7 +84,7 @@ class DepthShape:
     def _measured(self, first: Features, z: Matrix, second: Features, T_second_first: Matrix) -> "DepthShape":
         """Return the shape after matched features [M] of two views, the first with predicted depth z [M]."""
         kept = z > 0
-        if kept.sum() < LEAST_MATCHES:
+        if kept.sum() < FEWEST:
             return self
         pair = _Pair(first.take(kept), z[kept], second.take(kept))
         T, theta = T_second_first, self.theta
@@ -152,15 +152,14 @@ Floats = NDArray[np.float32]
 
 CELL_PX = 8
 """s and b are fitted to the medians of cells of this width: the noise of pixels would bias a fit to inverse depth."""
-LEAST_CELLS = 20
-ROUNDS = 5
-LEAST_SIGMA = 0.005
-HUBER = 1.5
+ROUNDS, WIDTH, LEAST_SIGMA = 5, 1.5, 0.005
+"""Rounds of reweighting; width of the Cauchy loss of cells, standard deviations; the least of these, share of depth."""
 STIFF_SCALE, STIFF_SHIFT = 1.0, 10.0
 """Weight of s = 1 and of b = 0 against the cells. Without the first, errors of the map would add up over keyframes."""
 LEAST_INVERSE = 1e-3
 """Predicted surfaces farther than the inverse of this, m, have no depth."""
 DIAMETER_PX, SPREAD_PX, SPREAD_SIGMA = 9, 3.0, 3.0
+"""Of the bilateral filter, as in `depth_filters`."""
 HOLE = -20.0
 """Logarithm of the depth of a pixel without depth: so far from all others that its weight is 0."""
 
@@ -188,7 +187,7 @@ class DepthFit:
         both = (shaped > 0) & (known_m > 0)
         found, known = _medians(shaped, both), _medians(known_m, both)
         used = (found > 0) & (known > 0)
-        if used.sum() < LEAST_CELLS:
+        if used.sum() < FEWEST:
             return self
         z = known[used]
         middle = float(np.median(z))
@@ -198,7 +197,7 @@ class DepthFit:
         for _ in range(ROUNDS):
             error = np.abs(A @ x - 1.0)
             sigma = max(1.4826 * float(np.median(error)), LEAST_SIGMA)
-            weight = 1.0 / (1.0 + (error / (HUBER * sigma)) ** 2)
+            weight = 1.0 / (1.0 + (error / (WIDTH * sigma)) ** 2)
             weight /= weight.sum()
             x = np.linalg.solve(A.T @ (weight[:, None] * A) + stiff, A.T @ weight + stiff @ goal)
         return replace(self, scale=float(x[0]), shift=float(x[1]) / middle)

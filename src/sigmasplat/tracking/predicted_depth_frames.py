@@ -6,14 +6,12 @@ import numpy as np
 from torch import Tensor
 
 from sigmasplat.data import se3
+from sigmasplat.fit.pose import OPAQUE
 from sigmasplat.render.view import View
 from sigmasplat.tracking.predicted_depth_fit import DepthFit
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 from sigmasplat.tracking.tracker import Tracker
 from sigmasplat.types import Matrix
-
-OPAQUE = 0.9
-"""The map shows a surface where its alpha is above this."""
 
 
 def fitted_to_map(tracker: Tracker, params: Tensor, view: View, seen: PreparedFrame) -> PreparedFrame:

@@ -22,7 +22,7 @@ from sigmasplat.fit.target import Keyframe
 from sigmasplat.render.view import View
 from sigmasplat.tracking.drift import UNKNOWN, floor, symmetric
 from sigmasplat.tracking.feature_image import FeatureImage, pose_by_features
-from sigmasplat.tracking.features import VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
+from sigmasplat.tracking.features import LEAST_INLIERS, VOTE_RATIO, Extractor, Features, Landmarks, matched_by_distance
 from sigmasplat.tracking.pose_validation import MOST_SPREAD_M, p_wrong, recognised
 from sigmasplat.tracking.prepared_frame import PreparedFrame, TrackedKeyframe
 from sigmasplat.types import Matrix, Task, at_once
@@ -63,13 +63,10 @@ class KnownMap:
 
 STRONGEST = 400
 """Number of features of each image that are compared to choose candidates."""
-LEAST_MATCHES = 8
 INDEX_AT_MOST = 25
 """Maximum number of keyframes whose features are found per call: 25 take about a second."""
 KEPT_LANDMARKS = 64
 """Number of keyframes whose complete landmarks stay in memory, half a megabyte each."""
-ENOUGH = 0.99
-"""A pose with a higher score ends the search."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +157,7 @@ class Relocaliser:
             verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= spread_m
             if verdict not in best or tried.score > best[verdict].score:
                 best[verdict] = tried
-            if verdict and tried.score > ENOUGH:
+            if verdict and recognised(tried.comparison, matches=0):  # as sure as without features
                 break
             yield
         return SearchResult(best.get(True), len(candidates), best.get(False))
@@ -202,7 +199,7 @@ class Relocaliser:
             for where in wanted
             if where in searched
         ]
-        best = sorted((vote for vote in votes if vote[0] >= LEAST_MATCHES), key=lambda vote: -vote[0])
+        best = sorted((vote for vote in votes if vote[0] >= LEAST_INLIERS), key=lambda vote: -vote[0])
         return [where for _, where in best[: self.config.recovery.candidates]]
 
     def _poses(self, known: KnownMap, view: View, seen: PreparedFrame, where: KeyframeId) -> Iterator[Relocation]:

@@ -296,8 +296,3 @@ class Tracker:
         self.previous = T_new_old @ self.previous if previous is None else previous
         self.keyframe = None if self.keyframe is None else self.keyframe.moved_by(T_new_old)
         self.detector = self.detector.moved_by(T_new_old)
-
-    def forget(self) -> None:
-        """Restart at the identity after a lost frame, as for the first one."""
-        self.previous = np.eye(4)
-        self.keyframe = self.keyframe_features = self.keyframe_front = None

@@ -36,8 +36,6 @@ columns (`coarse_step`)."""
 POSE_ERROR = 0.05
 """This share of the motion between both images is added to the window on each side: motion blur and calibration errors
 grow with the motion."""
-EDGE_RELATIVE = 0.05
-"""A depth step, where a region ends: neighbouring pixels differ by more than this share of the nearer depth."""
 LEAST_REGION, LEAST_SHARE = 0.01, 0.15
 """A region is in front if at least this share of the image's pixels, and of its own, are in places that were free."""
 WHOLE_SHARE = 0.05
@@ -145,7 +143,7 @@ def dynamic_mask(
 def smooth(depth: Depth) -> Mask:
     """Return the pixels with a reading that are not on the far side of a depth step."""
     nearest = least_around(depth, 3)
-    return np.asarray((depth > 0) & (depth <= (1 + EDGE_RELATIVE) * nearest))
+    return np.asarray((depth > 0) & (depth <= (1 + CLEAR_RELATIVE) * nearest))
 
 
 def enlarged(small: Mask, live_m: Depth, step: int = STEP, whole_objects: bool = True) -> tuple[Mask, Mask]:
@@ -181,7 +179,7 @@ def _holes_in(mask: Mask, thing: Mask | None, depth_m: Depth) -> Mask:
         near, far, of_thing = np.full(count + 1, np.inf), np.zeros(count + 1), thing.ravel()[edge]
         np.minimum.at(near, hole[of_thing], z[of_thing])
         np.maximum.at(far, hole[of_thing], z[of_thing])
-        reach = 1 + EDGE_RELATIVE
+        reach = 1 + CLEAR_RELATIVE
         alike = in_mask | ((z * reach >= near[hole]) & (z <= far[hole] * reach))
         own |= (2 * covered >= edges) & (np.bincount(hole[alike], minlength=count + 1) >= SURROUNDED * edges)
     own[0] = False

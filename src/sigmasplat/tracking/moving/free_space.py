@@ -15,7 +15,8 @@ Mask = NDArray[np.bool_]
 Floats = NDArray[np.floating]
 
 CLEAR_M, CLEAR_RELATIVE = 0.05, 0.05
-"""A place was free if the reference saw a surface farther than it by this distance plus this share of its depth."""
+"""A place was free if the reference saw a surface farther than it by this distance plus this share of its depth; the
+share alone tells neighbouring pixels of two surfaces apart."""
 AROUND_PX = 5
 """Least size of the window around a pixel of the reference in which all readings must be farther: poses have errors."""
 

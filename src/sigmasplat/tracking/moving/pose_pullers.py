@@ -15,8 +15,8 @@ from scipy.special import fdtri
 from sigmasplat.data import se3
 from sigmasplat.fit.align import Alignment, normal_equations
 from sigmasplat.fit.pose import PoseFit
-from sigmasplat.tracking.moving.dynamic_mask import EDGE_RELATIVE, DynamicMask, enlarged, smooth, thinned, with_margin
-from sigmasplat.tracking.moving.free_space import Depth, Mask, labelled, upper_median, widened
+from sigmasplat.tracking.moving.dynamic_mask import DynamicMask, enlarged, smooth, thinned, with_margin
+from sigmasplat.tracking.moving.free_space import CLEAR_RELATIVE, Depth, Mask, labelled, upper_median, widened
 from sigmasplat.tracking.pose_validation import wrong_odds
 from sigmasplat.tracking.prepared_frame import PreparedFrame
 
@@ -104,6 +104,6 @@ def _stands_free(depth: Depth, regions: NDArray[np.int32], region: int, box: NDA
     left, top, width, height, _ = box.tolist()
     around = slice(max(top - RING, 0), top + height + RING), slice(max(left - RING, 0), left + width + RING)
     near_m, inside = depth[around], regions[around] == region
-    far_m = upper_median(near_m[inside]) * (1 + EDGE_RELATIVE)
+    far_m = upper_median(near_m[inside]) * (1 + CLEAR_RELATIVE)
     ring = widened(inside, 2 * RING + 1) & ~widened(inside, 2 * RING - 1) & (near_m > 0)
     return bool(ring.any()) and bool((near_m[ring] > far_m).mean() >= FREE_AROUND)
