@@ -62,8 +62,7 @@ def final_map(
         store = without_moving(store, anchors, config)
     field, keyframes = seed(store, anchors, config), KeyframeReader(store, anchors, view)
     if config.moving.find:  # remove splats from space that the keyframes of all submaps see to be free
-        votes, scale = config.moving.carve_votes, config.render.scene_scale
-        remove(field, is_free(field.means.numpy(), keyframes, votes, scale))
+        remove(field, is_free(field.means.numpy(), keyframes, config.moving.carve_votes, config.render.scene_scale))
     if not config.final.iterations:
         return FinalMap(field)
     field.keep(torch.from_numpy(z_order(field.means.numpy())))

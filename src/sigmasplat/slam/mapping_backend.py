@@ -186,8 +186,7 @@ class MappingBackend(SlamState):
     def add_drift(self, T_submap_camera: Matrix, alignment: Alignment | None) -> float:
         """Add the hop to a keyframe to the submap's drift; return the standard deviation of its position, metres.
         alignment: as of `hop_to`."""
-        covariance = UNKNOWN_HOP.covariance if alignment is None else alignment.covariance
-        self.drift.hop(T_submap_camera, None if np.isnan(covariance).any() else covariance)
+        self.drift.hop(T_submap_camera, None if alignment is None else alignment.covariance)
         return self.drift.position_m(T_submap_camera)
 
     # ---- submaps ----

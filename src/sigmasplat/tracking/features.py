@@ -167,7 +167,6 @@ RANSAC_TRIES = 1000
 """Maximum number of minimal samples per pose. Fewer are drawn if a pose is found with `CONFIDENCE` sooner."""
 CONFIDENCE = 0.999
 NEAREST_M = 0.05
-"""Points that are nearer are behind the camera, as far as it can tell."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,10 @@ class PosePrediction:
     given: bool = False
 
 
+LONGEST_S = 1.0
+"""The camera is not expected to move on for longer: a hand has turned back by then."""
+
+
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
     """The motion of the camera at the time of a frame, s: T_last_camera [4, 4], and the time since the last frame, s;
@@ -44,6 +48,12 @@ class CameraMotion:
     def after(self, T_last_camera: Matrix, time_s: float) -> "CameraMotion":
         """Return the motion at the next frame."""
         return CameraMotion(time_s, T_last_camera, max(time_s - self.time_s, 0.0))
+
+    def until(self, time_s: float) -> Matrix:
+        """Return the motion T_last_camera [4, 4] to a time at constant velocity; the last one if frames are evenly
+        timed."""
+        share = min(time_s - self.time_s, LONGEST_S) / self.elapsed_s if self.elapsed_s else 1.0
+        return self.velocity if abs(share - 1.0) < 1e-3 else se3.exp(share * se3.log(self.velocity))
 
     def stopped(self) -> "CameraMotion":
         """Return no motion: poses of earlier frames do not agree with later ones."""

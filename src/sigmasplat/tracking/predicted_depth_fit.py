@@ -159,7 +159,6 @@ STIFF_SCALE, STIFF_SHIFT = 1.0, 10.0
 LEAST_INVERSE = 1e-3
 """Predicted surfaces farther than the inverse of this, m, have no depth."""
 DIAMETER_PX, SPREAD_PX, SPREAD_SIGMA = 9, 3.0, 3.0
-"""Of the bilateral filter, as in `depth_filters`."""
 HOLE = -20.0
 """Logarithm of the depth of a pixel without depth: so far from all others that its weight is 0."""
 

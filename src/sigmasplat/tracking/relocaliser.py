@@ -112,11 +112,6 @@ class Relocation:
         """Return where a submap begins that starts at this camera."""
         return RelativePose(self.where[0], submap, self.T_submap_camera, self.information, "relocalisation")
 
-    @property
-    def score(self) -> float:
-        """Return the probability that the pose is right."""
-        return 1.0 - p_wrong(self.comparison)
-
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
@@ -155,7 +150,7 @@ class Relocaliser:
         for tried in (pose for where in candidates for pose in self._poses(known, view, seen, where)):
             spread_m = MOST_SPREAD_M * view.options.scene_scale
             verdict = recognised(tried.comparison, tried.inliers) and tried.position_m <= spread_m
-            if verdict not in best or tried.score > best[verdict].score:
+            if verdict not in best or p_wrong(tried.comparison) < p_wrong(best[verdict].comparison):
                 best[verdict] = tried
             if verdict and recognised(tried.comparison, matches=0):  # as sure as without features
                 break

@@ -195,8 +195,9 @@ class Tracker:
     # ---- guesses ----
 
     def prediction(self, seen: PreparedFrame) -> PosePrediction:
-        """Return where the camera of the next frame is expected."""
-        return predict(self.previous, self.motion.velocity, self.prior, seen.frame.prior)
+        """Return where the camera of the next frame is expected; with `adam` as in the papers, whatever its time."""
+        motion = self.motion.velocity if self.config.method == "adam" else self.motion.until(seen.frame.timestamp_s)
+        return predict(self.previous, motion, self.prior, seen.frame.prior)
 
     def _fit(self, given: Given, seen: PreparedFrame, guess: Matrix, patience: int = 1) -> PoseFit:
         """Fit from an initial T_world_camera; patience: factor on the number of iterations of gradient descent; with 0,
@@ -218,7 +219,7 @@ class Tracker:
             if found is not None:
                 yield se3.inverse(found.T_live_reference @ self.keyframe.T_camera_world)
         if prediction.measured:
-            yield self.previous @ self.motion.velocity
+            yield self.previous @ self.motion.until(seen.frame.timestamp_s)
 
     def _restarted(self, given: Given, seen: PreparedFrame, fit: PoseFit) -> PoseFit:
         """Descend again with twice the iterations if the first loss jumped (VarSplat §3); return the only or the second

@@ -119,9 +119,8 @@ class DynamicDetector:
         for earlier in self.recent[before[-1] :]:  # what comes back to an earlier place has not rested there
             scene = self._earlier(earlier.depth_m, se3.inverse(earlier.T_world_camera) @ T_world_camera)
             known, same = seen_again(scene, depth, camera, step)
-            sizes, of_known, of_same = (
-                np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)
-            )
+            counts = [np.bincount(regions[m], minlength=count + 1) for m in (regions > 0, known, same)]
+            sizes, of_known, of_same = counts
             rests &= (of_same >= AT_REST * of_known) & (of_known >= KNOWN * sizes)
         rests[0] = False
         if not rests.any():

@@ -135,9 +135,8 @@ def dynamic_mask(
     if not moved.any():
         return None
     whole, hidden = enlarged(moved, live_m, step, whole_objects)
-    return DynamicMask(
-        hidden, np.where(whole, live_m, np.float32(0.0)), np.where(hidden, _behind(scene, camera, hidden), live_m)
-    )
+    scene_m = np.where(hidden, _behind(scene, camera, hidden), live_m)
+    return DynamicMask(hidden, np.where(whole, live_m, np.float32(0.0)), scene_m)
 
 
 def smooth(depth: Depth) -> Mask:
