@@ -19,7 +19,6 @@ MAX_DIFFERENCE, MEAN_DIFFERENCE, GRADIENT = 1e-2, 1e-4, 1e-2
 """If rounding moves a splat across the threshold alpha_min, a pixel can change by up to 1/255, and with it the
 gradient of this splat: the last value is a share of the norm of all gradients."""
 SPLATS, ROUNDS = 20_000, 6
-"""What is timed."""
 
 
 @dataclass(frozen=True)

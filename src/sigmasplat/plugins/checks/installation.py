@@ -73,13 +73,11 @@ def check_cuda() -> Iterator[Finding]:
     from sigmasplat.plugins.cuda import cubins, launch as cuda_launch
 
     try:
-        compiler = cubins.compiler_version()
         cached = len(list(cubins.cache_folder().glob("*.cubin")))
-        yield Finding("NVRTC", f"{compiler}, {cached} compiled programs in {cubins.cache_folder()}")
+        yield Finding("NVRTC", f"{cubins.compiler_version()}, {cached} compiled programs in {cubins.cache_folder()}")
     except BackendError as problem:
         yield Finding("NVRTC", f"missing: {problem}")
-    missing = cuda_launch.missing()
-    if missing:
+    if missing := cuda_launch.missing():
         yield Finding("CUDA", f"not available: {missing}")
         return
     for index in range(torch.cuda.device_count()):

@@ -139,5 +139,5 @@ class DynamicDetector:
         return replace(self, recent=recent)
 
     def cleared(self) -> "DynamicDetector":
-        """Return the same with nothing remembered."""
+        """Return the detector with nothing remembered."""
         return DynamicDetector(self.config, self.scene_scale)
