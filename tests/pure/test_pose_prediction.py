@@ -27,3 +27,10 @@ def test_after_a_pause_or_without_times_the_camera_is_not_expected_far_away() ->
     motion = CameraMotion(0.0).after(se3.exp(RATE / 30), 1 / 30)
     assert np.allclose(motion.until(60.0), se3.exp(RATE), atol=1e-12)
     assert np.array_equal(CameraMotion(0.0).after(se3.exp(RATE), 0.0).until(0.0), se3.exp(RATE))
+
+
+def test_slow_frames_and_frames_back_in_time_are_no_gap() -> None:
+    """One frame in 2 s, or times in ms taken for seconds: an even step is no gap. Nothing is expected to run back."""
+    slow = CameraMotion(0.0).after(se3.exp(RATE), 33.0)
+    assert np.array_equal(slow.until(66.0), se3.exp(RATE)) and np.allclose(slow.until(33.0), np.eye(4))
+    assert np.allclose(slow.until(20.0), np.eye(4)) and np.array_equal(slow.until(99.0), se3.exp(RATE))

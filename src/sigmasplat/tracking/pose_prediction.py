@@ -52,7 +52,8 @@ class CameraMotion:
     def until(self, time_s: float) -> Matrix:
         """Return the motion T_last_camera [4, 4] to a time at constant velocity; the last one if frames are evenly
         timed."""
-        share = min(time_s - self.time_s, LONGEST_S) / self.elapsed_s if self.elapsed_s else 1.0
+        elapsed_s = min(max(time_s - self.time_s, 0.0), max(LONGEST_S, self.elapsed_s))
+        share = elapsed_s / self.elapsed_s if self.elapsed_s else 1.0
         return self.velocity if abs(share - 1.0) < 1e-3 else se3.exp(share * se3.log(self.velocity))
 
     def stopped(self) -> "CameraMotion":
