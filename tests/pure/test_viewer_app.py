@@ -131,8 +131,8 @@ def test_predicted_errors_are_offered_for_the_final_map_only(
         wait_until(lambda before=before: len(client) > before)  # type: ignore[misc]
     wait_until(lambda: panel.legend.visible)
     app.show(Snapshot("room", EMPTY_PATH, None, (Piece(0, field),)))
-    wait_until(lambda: not offered())
-    assert panel.mode.value == MODES["splats"] and "viewer:" not in capsys.readouterr().err, "no error while drawing"
+    wait_until(lambda: not offered() and panel.mode.value == MODES["splats"])
+    assert "viewer:" not in capsys.readouterr().err, "no error while drawing"
 
 
 def turned(client: Any, opening: Opening) -> float:
