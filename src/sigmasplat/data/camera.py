@@ -27,7 +27,7 @@ class Camera:
     def __post_init__(self) -> None:
         both = (self.width, self.fx, self.cx), (self.height, self.fy, self.cy)
         if not all(n >= 1 and 1e-3 * n <= f <= 1e6 * n and abs(c) <= 1e6 * n for n, f, c in both):
-            raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive, all within reason)")
+            raise ConfigError(f"not a camera: {self} (sizes and focal lengths must be positive and plausible)")
 
     @property
     def width_rad(self) -> float:

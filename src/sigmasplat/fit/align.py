@@ -213,8 +213,7 @@ def align(
     on each coarser level), or when the relative change of the cost is below `plateau_stop` (0 = off). If the finest
     level meets neither condition, its best iterate is returned. Undetermined directions keep the guess. weight_color in
     [0, 1] balances gray against depth, each in units of its Huber width. Each step also finds the gain of the live
-    image. With 0 iterations the guess stays, and is judged. Raises BackendError if
-    only one image is on a device.
+    image. With 0 iterations the guess stays, and is judged. Raises BackendError if only one image is on a device.
     """
     if reference.kernels is not live.kernels:
         raise BackendError("the two images to align are on different devices; make both for the same view")

@@ -197,8 +197,10 @@ def named_as(paths: Iterable[Path], names: Iterable[str]) -> list[Path]:
 
 def image_folder(folder: Path, names: Sequence[str]) -> Path | None:
     """Return the first of the named subfolders that exists, else the only one that is `named_as` they are, or None."""
-    found = named_as((path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else (), names)
-    return first_subfolder(folder, names) or (found[0] if len(found) == 1 else None)
+    if (known := first_subfolder(folder, names)) or not folder.is_dir():
+        return known
+    found = named_as((path for path in folder.iterdir() if path.is_dir()), names)
+    return found[0] if len(found) == 1 else None
 
 
 def first_file(folder: Path, names: Iterable[str | Path]) -> Path | None:

@@ -57,8 +57,7 @@ def automatic() -> Automatic:
             tried = Automatic(why=f"computing on the CPU, because {problem}")
             continue
         if found.ok:
-            passed = f"computing on {device}, whose self-test passed; SIGMASPLAT_BACKEND=cpu turns it off"
-            return Automatic(row.name, passed)
+            return Automatic(row.name, f"computing on {device}, whose self-test passed; SIGMASPLAT_BACKEND=cpu stops it")
         tried = Automatic(why=f"computing on the CPU, because the self-test of {device} failed: {found}")
     return tried
 
