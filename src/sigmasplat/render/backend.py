@@ -57,7 +57,8 @@ def automatic() -> Automatic:
             tried = Automatic(why=f"computing on the CPU, because {problem}")
             continue
         if found.ok:
-            return Automatic(row.name, f"computing on {device}, whose self-test passed; SIGMASPLAT_BACKEND=cpu stops it")
+            passed = f"computing on {device}, whose self-test passed; SIGMASPLAT_BACKEND=cpu turns it off"
+            return Automatic(row.name, passed)
         tried = Automatic(why=f"computing on the CPU, because the self-test of {device} failed: {found}")
     return tried
 

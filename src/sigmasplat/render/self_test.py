@@ -1,8 +1,8 @@
 """Test a backend before it is used: one image of a few hundred splats and its gradient, against the definition."""
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from timeit import repeat
 
 import numpy as np
 import torch
@@ -49,12 +49,8 @@ def self_test(make: Maker) -> SelfTest:
 def kernel_speed(make: Maker) -> str:
     """Return in words how long an image with its gradient takes; the first one, which compiles kernels, apart."""
     rows, camera = _cloud(SPLATS, 0.02), Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-    view, times_s = make(camera, RenderConfig(), True), list[float]()
-    for _ in range(ROUNDS + 1):
-        started_s = time.perf_counter()
-        _gradient(view, rows)
-        times_s.append(time.perf_counter() - started_s)
-    first, *others = (1000.0 * each for each in times_s)
+    view = make(camera, RenderConfig(), True)
+    first, *others = (1000.0 * each for each in repeat(lambda: _gradient(view, rows), number=1, repeat=ROUNDS + 1))
     work = f"an image of 320×240 from {SPLATS:,} splats with gradients"
     return f"{np.median(others):.1f} ms for {work} (the first {first:.0f} ms)"
 
